@@ -1,0 +1,1 @@
+//! Data sets, a virtual scanner, training and evaluation around the `upcr` library.

@@ -1,0 +1,57 @@
+//! Point clouds, meshes and what is done to them before anything else: sampling, normals, cleaning.
+
+/// A point cloud in its file's own frame and unit.
+///
+/// Coordinates are `f64` so that georeferenced scans (offsets of 1e6 m and more) lose nothing.
+/// `normals` and `colors`, where present, have one entry a point.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PointCloud {
+    /// Positions.
+    pub points: Vec<[f64; 3]>,
+    /// Unit normals.
+    pub normals: Option<Vec<[f32; 3]>>,
+    /// Red, green, blue, 0 to 255.
+    pub colors: Option<Vec<[u8; 3]>>,
+    /// Where the sensor stood, in the cloud's frame, where the file says so.
+    pub viewpoint: Option<[f64; 3]>,
+}
+
+/// A triangle mesh, read from OFF, OBJ, STL or a PLY with faces, to be sampled into a cloud.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct TriangleMesh {
+    /// Positions.
+    pub vertices: Vec<[f64; 3]>,
+    /// Indices into `vertices`, counter-clockwise seen from outside.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+impl PointCloud {
+    /// A cloud of bare points.
+    pub fn from_points(points: Vec<[f64; 3]>) -> Self {
+        Self { points, ..Self::default() }
+    }
+
+    /// Number of points.
+    pub fn len(&self) -> usize {
+        self.points.len()
+    }
+
+    /// Whether there is no point.
+    pub fn is_empty(&self) -> bool {
+        self.points.is_empty()
+    }
+
+    /// The cloud of the points at `indices`, in that order, with their normals and colours.
+    ///
+    /// # Panics
+    /// Where an index is not below `self.len()`.
+    #[must_use]
+    pub fn select(&self, indices: &[usize]) -> Self {
+        Self {
+            points: indices.iter().map(|&i| self.points[i]).collect(),
+            normals: self.normals.as_ref().map(|n| indices.iter().map(|&i| n[i]).collect()),
+            colors: self.colors.as_ref().map(|c| indices.iter().map(|&i| c[i]).collect()),
+            viewpoint: self.viewpoint,
+        }
+    }
+}
