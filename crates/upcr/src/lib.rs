@@ -3,12 +3,19 @@
 pub mod cloud;
 pub mod error;
 pub mod features;
+mod hypothesis;
 pub mod io;
 pub mod neighbors;
+mod prepare;
+mod refine;
 mod register;
 pub mod transform;
+mod verify;
 
 pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
-pub use register::{Locks, Method, Reason, Refinement, Registration, Settings, Timings, register};
+pub use refine::RobustKernel;
+pub use register::{
+    Locks, Method, Reason, Refinement, Registration, Settings, TRUSTWORTHY, Timings, register,
+};
 pub use transform::Rigid;

@@ -1,10 +1,21 @@
 //! The one pipeline: prepare, hypotheses, refine, verify.
 
-use std::num::NonZeroUsize;
+use std::{num::NonZeroUsize, time::Instant};
 
+use nalgebra::Matrix6;
+use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::{PointCloud, Result, transform::Rigid};
+use crate::{
+    CloudRole, Error, PointCloud, Result,
+    cloud::orient_by_curvature,
+    features::{Descriptors, Feature, FeatureInput, Fpfh},
+    hypothesis::{Hypothesis, Match, Problem, SOURCES, match_levels, separation},
+    prepare::{Level, Prepared, check, derive_voxel_size, prepare},
+    refine::{LockedPose, Refined, RobustKernel, Schedule, factor, refine},
+    transform::Rigid,
+    verify::{Evidence, covariance, distances, judge, symmetric_score, weakest_direction},
+};
 
 /// Where the first pose comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
@@ -19,6 +30,8 @@ pub enum Method {
     Fgr,
     /// Feature RANSAC.
     Ransac,
+    /// Feature matches that agree with each other (second-order spatial compatibility).
+    Consensus,
 }
 
 /// What the refinement minimises.
@@ -55,6 +68,18 @@ pub struct Locks {
     pub z: bool,
 }
 
+impl Locks {
+    /// Roll, pitch, yaw, x, y, z.
+    pub fn flags(&self) -> [bool; 6] {
+        [self.roll, self.pitch, self.yaw, self.x, self.y, self.z]
+    }
+
+    /// Whether anything is locked.
+    pub fn any(&self) -> bool {
+        self.flags().contains(&true)
+    }
+}
+
 /// All that a registration can be told. `Settings::default()` is meant to be enough.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Settings {
@@ -66,6 +91,10 @@ pub struct Settings {
     pub voxel_size: Option<f64>,
     /// A first guess of `T_target_source`, in the files' frames.
     pub init: Option<Rigid>,
+    /// How residuals of the refinement are weighed.
+    pub kernel: RobustKernel,
+    /// Share of the closest pairs that the refinement keeps, 0 to 1; `None`: all within reach.
+    pub overlap: Option<f64>,
     /// Degrees of freedom held at the initial pose's values.
     pub locks: Locks,
     /// Seed of every random choice.
@@ -81,6 +110,8 @@ impl Default for Settings {
             refine: Refinement::Gicp,
             voxel_size: None,
             init: None,
+            kernel: RobustKernel::default(),
+            overlap: None,
             locks: Locks::default(),
             seed: 0,
             threads: None,
@@ -153,22 +184,334 @@ pub struct Registration {
     pub timings_ms: Timings,
 }
 
+/// Probability from which a pose is called registered.
+pub const TRUSTWORTHY: f64 = 0.5;
+
+impl Registration {
+    /// Whether the pose is more likely right than wrong.
+    pub fn is_trustworthy(&self) -> bool {
+        self.probability >= TRUSTWORTHY
+    }
+}
+
+/// Probability from which no dearer source of hypotheses is asked.
+const SURE: f64 = 0.9;
+/// Hypotheses that are refined on the coarse level, and of those on the fine one.
+const COARSE_CANDIDATES: usize = 8;
+const FINE_CANDIDATES: usize = 3;
+/// Points that score a raw hypothesis, that refine it coarsely, and that score a refined one.
+const RANKING_POINTS: usize = 256;
+const COARSE_POINTS: usize = 400;
+const SCORING_POINTS: usize = 1500;
+/// Points that refine the final pose at most.
+const FINE_POINTS: usize = 6000;
+/// Scales over which refined poses are compared, each half the one before.
+const SCORING_SCALES: u32 = 4;
+/// Poses closer than this many voxels at the source's rim are one answer.
+const DISTINCT_VOXELS: f64 = 6.0;
+
 /// Finds the pose that lays `source` on `target`.
+///
+/// # Errors
+/// Where a cloud is too small, degenerate or not finite, or a setting is out of its range. Clouds that cannot
+/// be registered are no error: the result says so (`probability`, `reasons`).
 pub fn register(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
-    let _ = (source, target);
-    Ok(Registration {
-        T_target_source: Rigid::identity(),
-        fitness: 0.0,
-        inlier_rmse: 0.0,
-        num_inliers: 0,
-        converged: false,
-        iterations: 0,
-        probability: 0.0,
-        covariance: [[0.0; 6]; 6],
-        reasons: vec![Reason::NoOverlap],
-        method: settings.method,
-        voxel_size: 0.0,
-        settings: settings.clone(),
-        timings_ms: Timings::default(),
-    })
+    let Some(threads) = settings.threads else { return run(source, target, settings) };
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads.get())
+        .build()
+        .map_err(|e| Error::InvalidSetting { name: "threads", reason: e.to_string() })?;
+    pool.install(|| run(source, target, settings))
+}
+
+/// A refined pose with its score.
+struct Candidate {
+    method: Method,
+    refined: Refined,
+    score: f64,
+    sharpness: f64,
+}
+
+fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
+    let start = Instant::now();
+    let (source, target) = (check(source, CloudRole::Source)?, check(target, CloudRole::Target)?);
+    let voxel_size = match settings.voxel_size {
+        Some(v) if v.is_finite() && v > 0.0 => v,
+        Some(v) => {
+            return Err(Error::InvalidSetting {
+                name: "voxel_size",
+                reason: format!("must be a positive length, not {v}"),
+            });
+        }
+        None => derive_voxel_size(&source, &target),
+    };
+    let features = settings.method != Method::Prior;
+    let (source, target) =
+        rayon::join(|| prepare(&source, voxel_size, features), || prepare(&target, voxel_size, features));
+    let (source, target) = (source?, target?);
+    let mut pipeline = Pipeline::new(&source, &target, voxel_size, settings);
+    pipeline.timings.prepare = milliseconds(start);
+    let mut best = pipeline.best()?;
+    best.timings_ms.total = milliseconds(start);
+    Ok(best)
+}
+
+fn milliseconds(since: Instant) -> f64 {
+    since.elapsed().as_secs_f64() * 1e3
+}
+
+/// Two prepared clouds and what is known of them so far.
+struct Pipeline<'a> {
+    source: &'a Prepared,
+    target: &'a Prepared,
+    settings: &'a Settings,
+    voxel_size: f64,
+    init: Rigid,
+    lock: Option<LockedPose>,
+    matches: Vec<Match>,
+    candidates: Vec<Candidate>,
+    timings: Timings,
+}
+
+impl<'a> Pipeline<'a> {
+    fn new(source: &'a Prepared, target: &'a Prepared, voxel_size: f64, settings: &'a Settings) -> Self {
+        let init = settings.init.unwrap_or_else(Rigid::identity);
+        let lock = LockedPose::new(settings.locks, &init, source.origin, target.origin);
+        let init = to_local(&init, source, target);
+        Self {
+            source,
+            target,
+            settings,
+            voxel_size,
+            init,
+            lock,
+            matches: Vec::new(),
+            candidates: Vec::new(),
+            timings: Timings::default(),
+        }
+    }
+
+    /// Asks one source of hypotheses after the other until the verdict is sure.
+    fn best(&mut self) -> Result<Registration> {
+        let mut best = None;
+        for source in SOURCES {
+            if !self.wants(source.method()) {
+                continue;
+            }
+            let start = Instant::now();
+            if source.needs_matches() && self.matches.is_empty() {
+                self.matches = self.feature_matches()?;
+            }
+            let coarse = self.source.coarse().voxel_size.max(self.target.coarse().voxel_size);
+            let hypotheses = source.propose(&Problem {
+                source: self.source,
+                target: self.target,
+                matches: &self.matches,
+                init: self.init,
+                tolerance: TOLERANCE_VOXELS * coarse,
+                seed: self.settings.seed,
+            });
+            self.timings.hypotheses += milliseconds(start);
+            let start = Instant::now();
+            self.refine_hypotheses(&hypotheses);
+            self.timings.refine += milliseconds(start);
+            let start = Instant::now();
+            let registration = self.verified();
+            self.timings.verify += milliseconds(start);
+            let sure = registration.probability >= SURE;
+            best = Some(Registration { timings_ms: self.timings, ..registration });
+            if sure {
+                break;
+            }
+        }
+        best.ok_or_else(|| Error::InvalidSetting {
+            name: "method",
+            reason: "no source of hypotheses has this name".into(),
+        })
+    }
+
+    fn wants(&self, method: Method) -> bool {
+        match self.settings.method {
+            Method::Auto => method != Method::Prior || self.settings.init.is_some(),
+            chosen => chosen == method,
+        }
+    }
+
+    fn feature_matches(&self) -> Result<Vec<Match>> {
+        let (a, b) = (self.source.coarse(), self.target.coarse());
+        let (da, db) = rayon::join(|| describe(a), || describe(b));
+        Ok(match_levels((a, &da?), (b, &db?)))
+    }
+
+    /// Ranks hypotheses by overlap, refines the best coarsely, ranks again, refines the best of those finely.
+    fn refine_hypotheses(&mut self, hypotheses: &[Hypothesis]) {
+        let (source, target) = (self.source.coarse(), self.target.coarse());
+        let all = |level: &Level, count| {
+            Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), count)
+        };
+        let limit = 2.0 * source.voxel_size.max(target.voxel_size);
+        let rank = |pose: &Rigid, points: usize| {
+            let forward = distances(source, &all(source, points), target, pose, limit);
+            let backward = distances(target, &all(target, points), source, &pose.inverse(), limit);
+            symmetric_score(&forward, &backward, limit, 2)
+        };
+        let mut ranked: Vec<(f64, Hypothesis)> =
+            hypotheses.par_iter().map(|h| (rank(&h.pose, RANKING_POINTS), *h)).collect();
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        ranked.truncate(COARSE_CANDIDATES);
+
+        let moved = all(source, COARSE_POINTS);
+        let schedule = Schedule {
+            max_distance: (2.0 * limit, limit),
+            shrink_over: 4,
+            max_iterations: 8,
+            keep: 1.0,
+        };
+        let factor = factor(self.settings.refine);
+        let lock = self.lock.as_ref();
+        if self.settings.refine != Refinement::None {
+            ranked = ranked
+                .par_iter()
+                .map(|(_, h)| {
+                    let kernel = self.settings.kernel;
+                    let refined = refine(source, &moved, target, &h.pose, factor, kernel, &schedule, lock);
+                    (rank(&refined.pose, SCORING_POINTS), Hypothesis { pose: refined.pose, ..*h })
+                })
+                .collect();
+            ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        }
+        let radius = f64::from(self.source.fine.radius);
+        let mut distinct: Vec<Hypothesis> = Vec::new();
+        for (_, h) in ranked {
+            let new = |d: &Hypothesis| separation(&d.pose, &h.pose, radius) > f64::from(limit);
+            if distinct.len() < FINE_CANDIDATES && distinct.iter().all(new) {
+                distinct.push(h);
+            }
+        }
+        for h in distinct {
+            let candidate = self.finely_refined(&h);
+            self.candidates.push(candidate);
+        }
+        self.candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
+    }
+
+    fn finely_refined(&self, hypothesis: &Hypothesis) -> Candidate {
+        let (source, target) = (&self.source.fine, &self.target.fine);
+        let voxel = self.voxel_size as f32;
+        let lock = self.lock.as_ref();
+        let iterations = if self.settings.refine == Refinement::None { 0 } else { 30 };
+        let first = if hypothesis.method == Method::Prior { 6.0 } else { 3.0 };
+        let schedule = Schedule {
+            max_distance: (first * voxel, voxel),
+            shrink_over: 6,
+            max_iterations: iterations,
+            keep: self.settings.overlap.unwrap_or(1.0),
+        };
+        let moved = Level::thin(&self.source.refined_points(), FINE_POINTS);
+        let factor = factor(self.settings.refine);
+        let kernel = self.settings.kernel;
+        let refined = refine(source, &moved, target, &hypothesis.pose, factor, kernel, &schedule, lock);
+        let all = |level: &Level| {
+            Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), SCORING_POINTS)
+        };
+        let limit = 2.0 * voxel;
+        let forward = distances(source, &all(source), target, &refined.pose, limit);
+        let backward = distances(target, &all(target), source, &refined.pose.inverse(), limit);
+        let score = symmetric_score(&forward, &backward, limit, SCORING_SCALES);
+        let coarse = symmetric_score(&forward, &backward, limit, 1);
+        Candidate { method: hypothesis.method, refined, score, sharpness: score / coarse.max(1e-9) }
+    }
+
+    /// The best candidate with the verdict on it.
+    fn verified(&self) -> Registration {
+        let radius = f64::from(self.source.fine.radius);
+        let Some(best) = self.candidates.first() else { return self.nothing_found() };
+        let pose = &best.refined.pose;
+        let distinct = DISTINCT_VOXELS * self.voxel_size;
+        let runner_up = self
+            .candidates
+            .iter()
+            .find(|c| separation(&c.refined.pose, pose, radius) > distinct)
+            .map_or(0.0, |c| c.score / best.score.max(f64::MIN_POSITIVE));
+        let (source, target) = (&self.source.fine, &self.target.fine);
+        let limit = self.voxel_size as f32;
+        let forward = distances(source, &self.source.held_out_points(), target, pose, limit);
+        let backward = distances(target, &self.target.held_out_points(), source, &pose.inverse(), limit);
+        let (weakest, conditioning) = weakest_direction(&best.refined.hessian, radius);
+        let _ = weakest;
+        let inliers = forward.within(limit) + backward.within(limit);
+        let evidence = Evidence {
+            overlap: [forward.share(limit), backward.share(limit)],
+            inliers,
+            sharpness: best.sharpness,
+            runner_up,
+            conditioning,
+            converged: best.refined.converged || self.settings.refine == Refinement::None,
+            points: source.points.len().min(target.points.len()),
+        };
+        let verdict = judge(&evidence);
+        let covariance = covariance(&best.refined.hessian, best.refined.variance, radius);
+        Registration {
+            T_target_source: match &self.lock {
+                Some(lock) => lock.file_pose(pose),
+                None => to_file(pose, self.source, self.target),
+            },
+            fitness: forward.share(limit),
+            inlier_rmse: forward.rmse(limit),
+            num_inliers: forward.within(limit),
+            converged: evidence.converged && inliers >= 3,
+            iterations: best.refined.iterations,
+            probability: verdict.probability,
+            covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
+            reasons: verdict.reasons,
+            method: best.method,
+            voxel_size: self.voxel_size,
+            settings: Settings { voxel_size: Some(self.voxel_size), ..self.settings.clone() },
+            timings_ms: Timings::default(),
+        }
+    }
+
+    /// The answer where no source of hypotheses had any.
+    fn nothing_found(&self) -> Registration {
+        let radius = f64::from(self.source.fine.radius);
+        let covariance = covariance(&Matrix6::zeros(), 0.0, radius);
+        Registration {
+            T_target_source: to_file(&self.init, self.source, self.target),
+            fitness: 0.0,
+            inlier_rmse: 0.0,
+            num_inliers: 0,
+            converged: false,
+            iterations: 0,
+            probability: 0.0,
+            covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
+            reasons: vec![Reason::NoOverlap],
+            method: self.settings.method,
+            voxel_size: self.voxel_size,
+            settings: Settings { voxel_size: Some(self.voxel_size), ..self.settings.clone() },
+            timings_ms: Timings::default(),
+        }
+    }
+}
+
+/// Matched points lie this many coarse voxels apart at most under a right pose.
+const TOLERANCE_VOXELS: f32 = 1.5;
+
+/// Reach of a feature, and the most neighbours it looks at.
+const FEATURE_RADIUS_VOXELS: f32 = 5.0;
+const FEATURE_NEIGHBORS: usize = 100;
+
+fn describe(level: &Level) -> Result<Descriptors> {
+    let neighborhoods = level.tree.radius_graph(FEATURE_RADIUS_VOXELS * level.voxel_size, FEATURE_NEIGHBORS);
+    let mut normals = level.normals.clone();
+    orient_by_curvature(&level.points, &mut normals, &neighborhoods);
+    let input = FeatureInput { points: &level.points, normals: &normals, neighborhoods: &neighborhoods };
+    Fpfh.compute(&input)
+}
+
+fn to_local(file: &Rigid, source: &Prepared, target: &Prepared) -> Rigid {
+    Rigid::from_translation(target.origin).inverse() * *file * Rigid::from_translation(source.origin)
+}
+
+fn to_file(local: &Rigid, source: &Prepared, target: &Prepared) -> Rigid {
+    Rigid::from_translation(target.origin) * *local * Rigid::from_translation(source.origin).inverse()
 }

@@ -2,3 +2,4 @@
 
 mod rigid;
 pub use rigid::Rigid;
+pub(crate) use rigid::nearest_rotation;

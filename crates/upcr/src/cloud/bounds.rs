@@ -1,0 +1,56 @@
+//! Bounding box, and the check that every coordinate is a number.
+
+use crate::{CloudRole, Error, PointCloud, Result};
+
+/// Axis-aligned bounding box.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bounds {
+    /// Lowest corner.
+    pub min: [f64; 3],
+    /// Highest corner.
+    pub max: [f64; 3],
+}
+
+impl Bounds {
+    /// Midpoint.
+    pub fn center(&self) -> [f64; 3] {
+        std::array::from_fn(|k| self.min[k] + 0.5 * (self.max[k] - self.min[k]))
+    }
+
+    /// Edge lengths.
+    pub fn extent(&self) -> [f64; 3] {
+        std::array::from_fn(|k| self.max[k] - self.min[k])
+    }
+
+    /// Length of the diagonal.
+    pub fn diagonal(&self) -> f64 {
+        self.extent().iter().map(|e| e * e).sum::<f64>().sqrt()
+    }
+}
+
+impl PointCloud {
+    /// Bounding box of the points, `None` for an empty cloud.
+    ///
+    /// # Errors
+    /// [`Error::NonFinite`], naming `role`, where a coordinate is NaN or infinite.
+    pub fn checked_bounds(&self, role: CloudRole) -> Result<Option<Bounds>> {
+        let (mut min, mut max) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+        let mut finite = true;
+        for p in &self.points {
+            for k in 0..3 {
+                min[k] = min[k].min(p[k]);
+                max[k] = max[k].max(p[k]);
+                finite &= p[k].is_finite();
+            }
+        }
+        if !finite {
+            let bad = |p: &&[f64; 3]| p.iter().any(|v| !v.is_finite());
+            return Err(Error::NonFinite {
+                role,
+                count: self.points.iter().filter(bad).count(),
+                first: self.points.iter().position(|p| bad(&p)).unwrap_or(0),
+            });
+        }
+        Ok((!self.is_empty()).then_some(Bounds { min, max }))
+    }
+}

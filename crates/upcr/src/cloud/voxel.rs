@@ -1,0 +1,278 @@
+//! Voxel-grid downsampling: one averaged point per occupied cell.
+
+use crate::PointCloud;
+
+/// Cell coordinates are kept below this so that three of them fit one 64-bit key.
+const MAX_CELLS_PER_AXIS: f64 = (1u64 << 21) as f64;
+
+/// What fell into one cell: sums about the grid's corner, and how many points.
+///
+/// The second moments make the surface normal a by-product of the one pass over the points.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Cell {
+    /// Σ p
+    pub sum: [f64; 3],
+    /// Σ p pᵀ: xx, xy, xz, yy, yz, zz
+    pub outer: [f64; 6],
+    /// Number of points.
+    pub count: f64,
+}
+
+impl Cell {
+    fn add(&mut self, p: [f64; 3]) {
+        self.count += 1.0;
+        for k in 0..3 {
+            self.sum[k] += p[k];
+        }
+        let [x, y, z] = p;
+        for (s, v) in self.outer.iter_mut().zip([x * x, x * y, x * z, y * y, y * z, z * z]) {
+            *s += v;
+        }
+    }
+
+    /// Adds what another cell holds.
+    pub fn merge(&mut self, other: &Self) {
+        self.count += other.count;
+        for k in 0..3 {
+            self.sum[k] += other.sum[k];
+        }
+        for k in 0..6 {
+            self.outer[k] += other.outer[k];
+        }
+    }
+
+    /// Covariance of the points: xx, xy, xz, yy, yz, zz.
+    pub fn covariance(&self) -> [f64; 6] {
+        let [x, y, z] = self.mean();
+        let square = [x * x, x * y, x * z, y * y, y * z, z * z];
+        std::array::from_fn(|k| self.outer[k] / self.count - square[k])
+    }
+
+    /// Mean of the points.
+    pub fn mean(&self) -> [f64; 3] {
+        self.sum.map(|s| s / self.count)
+    }
+}
+
+/// Occupied cells of a regular grid, in the order in which the points first entered them.
+#[derive(Debug, Clone)]
+pub(crate) struct VoxelGrid {
+    /// The occupied cells.
+    pub cells: Vec<Cell>,
+    keys: Vec<u64>,
+    table: CellTable,
+}
+
+/// The smallest voxel a grid over a cloud of this extent can have.
+pub(crate) fn smallest_voxel_size(extent: f64) -> f64 {
+    extent / (MAX_CELLS_PER_AXIS - 3.0)
+}
+
+impl VoxelGrid {
+    /// Sorts `points`, shifted by `-origin`, into cells of edge `voxel_size`; `corner` is the lowest corner
+    /// of the shifted points.
+    pub fn new(
+        points: impl Iterator<Item = [f64; 3]>,
+        origin: [f64; 3],
+        corner: [f64; 3],
+        voxel_size: f64,
+    ) -> Self {
+        let mut grid = Self { cells: Vec::new(), keys: Vec::new(), table: CellTable::with_capacity(4096) };
+        let scale = 1.0 / voxel_size;
+        let (mut last_key, mut last_cell) = (EMPTY, 0);
+        for p in points {
+            let local = [p[0] - origin[0], p[1] - origin[1], p[2] - origin[2]];
+            let key = key_of(std::array::from_fn(|k| ((local[k] - corner[k]) * scale) as u64));
+            // Neighbouring points of a scan mostly share a cell.
+            if key != last_key {
+                last_cell = grid.table.entry(key, grid.cells.len() as u32) as usize;
+                last_key = key;
+                if last_cell == grid.cells.len() {
+                    grid.cells.push(Cell::default());
+                    grid.keys.push(key);
+                }
+            }
+            grid.cells[last_cell].add(local);
+        }
+        grid
+    }
+
+    /// The grid of twice the voxel size, its cells the sums of up to eight of this grid's.
+    pub fn coarsened(&self) -> Self {
+        let mut grid =
+            Self { cells: Vec::new(), keys: Vec::new(), table: CellTable::with_capacity(self.cells.len()) };
+        for (cell, &key) in self.cells.iter().zip(&self.keys) {
+            let key = key_of(unpack(key).map(|c| (c - 1) / 2));
+            let at = grid.table.entry(key, grid.cells.len() as u32) as usize;
+            if at == grid.cells.len() {
+                grid.cells.push(Cell::default());
+                grid.keys.push(key);
+            }
+            grid.cells[at].merge(cell);
+        }
+        grid
+    }
+
+    /// Moments of cell `i` and the up to 26 occupied cells around it.
+    pub fn surroundings(&self, i: usize) -> Cell {
+        let mut sum = Cell::default();
+        let [x, y, z] = unpack(self.keys[i]);
+        for dx in 0..3 {
+            for dy in 0..3 {
+                for dz in 0..3 {
+                    // Keys are stored one up (see `key_of`), so one below never wraps.
+                    if let Some(j) = self.table.get(pack([x + dx - 1, y + dy - 1, z + dz - 1])) {
+                        sum.merge(&self.cells[j as usize]);
+                    }
+                }
+            }
+        }
+        sum
+    }
+}
+
+/// Number of cells of edge `voxel_size` that `points` occupy.
+pub(crate) fn count_occupied(points: &[[f64; 3]], corner: [f64; 3], voxel_size: f64) -> usize {
+    let mut table = CellTable::with_capacity(4096);
+    let scale = 1.0 / voxel_size;
+    let mut count = 0;
+    for p in points {
+        let key = key_of(std::array::from_fn(|k| ((p[k] - corner[k]) * scale) as u64));
+        if table.entry(key, count) == count {
+            count += 1;
+        }
+    }
+    count as usize
+}
+
+impl PointCloud {
+    /// One point per occupied cell of a grid of edge `voxel_size`: the mean of the cell's points, colours
+    /// and normals, in the order in which the cells are first met.
+    ///
+    /// # Errors
+    /// [`crate::Error::InvalidSetting`] where `voxel_size` is not positive or the cloud is over 2²¹ cells wide;
+    /// [`crate::Error::NonFinite`] where a coordinate is not finite.
+    pub fn voxel_downsample(&self, voxel_size: f64) -> crate::Result<Self> {
+        let bounds = self.checked_bounds(crate::CloudRole::Cloud)?;
+        if !(voxel_size.is_finite() && voxel_size > 0.0) {
+            return Err(crate::Error::InvalidSetting {
+                name: "voxel_size",
+                reason: format!("must be a positive length, not {voxel_size}"),
+            });
+        }
+        let Some(bounds) = bounds else { return Ok(self.clone()) };
+        let extent = bounds.extent().into_iter().fold(0.0, f64::max);
+        if voxel_size < smallest_voxel_size(extent) {
+            return Err(crate::Error::InvalidSetting {
+                name: "voxel_size",
+                reason: format!(
+                    "{voxel_size} cuts the cloud's extent of {extent} into more than 2097148 cells an axis"
+                ),
+            });
+        }
+        let scale = 1.0 / voxel_size;
+        let mut table = CellTable::with_capacity(4096);
+        let mut means: Vec<Mean> = Vec::new();
+        for (i, p) in self.points.iter().enumerate() {
+            let local: [f64; 3] = std::array::from_fn(|k| p[k] - bounds.min[k]);
+            let cell = table.entry(key_of(local.map(|v| (v * scale) as u64)), means.len() as u32) as usize;
+            if cell == means.len() {
+                means.push(Mean::default());
+            }
+            let mean = &mut means[cell];
+            mean.count += 1.0;
+            for k in 0..3 {
+                mean.point[k] += local[k];
+                mean.normal[k] += self.normals.as_ref().map_or(0.0, |n| n[i][k]);
+                mean.color[k] += self.colors.as_ref().map_or(0.0, |c| f32::from(c[i][k]));
+            }
+        }
+        let unit = |n: [f32; 3]| {
+            let length = n.iter().map(|v| v * v).sum::<f32>().sqrt();
+            if length > 0.0 { n.map(|v| v / length) } else { n }
+        };
+        Ok(Self {
+            points: means
+                .iter()
+                .map(|m| std::array::from_fn(|k| m.point[k] / m.count + bounds.min[k]))
+                .collect(),
+            normals: self.normals.as_ref().map(|_| means.iter().map(|m| unit(m.normal)).collect()),
+            colors: self.colors.as_ref().map(|_| {
+                means.iter().map(|m| m.color.map(|c| (c / m.count as f32).round() as u8)).collect()
+            }),
+            viewpoint: self.viewpoint,
+        })
+    }
+}
+
+/// Running sums of one cell's points and what they carry.
+#[derive(Default)]
+struct Mean {
+    point: [f64; 3],
+    normal: [f32; 3],
+    color: [f32; 3],
+    count: f64,
+}
+
+const EMPTY: u64 = u64::MAX;
+
+/// Cell coordinates to a key; each is moved up by one so that a cell's lower neighbours have keys too.
+fn key_of(cell: [u64; 3]) -> u64 {
+    pack(cell.map(|c| c + 1))
+}
+
+fn pack(cell: [u64; 3]) -> u64 {
+    cell[0] | cell[1] << 21 | cell[2] << 42
+}
+
+fn unpack(key: u64) -> [u64; 3] {
+    let mask = (1 << 21) - 1;
+    [key & mask, key >> 21 & mask, key >> 42 & mask]
+}
+
+/// Open-addressing map from cell keys to consecutive numbers.
+#[derive(Debug, Clone)]
+struct CellTable {
+    slots: Vec<(u64, u32)>,
+    len: usize,
+}
+
+impl CellTable {
+    fn with_capacity(slots: usize) -> Self {
+        Self { slots: vec![(EMPTY, 0); slots.next_power_of_two()], len: 0 }
+    }
+
+    fn slot(&self, key: u64) -> usize {
+        let mask = self.slots.len() - 1;
+        // Fibonacci hashing; the high bits are the well mixed ones.
+        let mut at = (key.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 32) as usize & mask;
+        while self.slots[at].0 != key && self.slots[at].0 != EMPTY {
+            at = (at + 1) & mask;
+        }
+        at
+    }
+
+    /// The number stored under `key`; `new` is stored and returned where there is none.
+    fn entry(&mut self, key: u64, new: u32) -> u32 {
+        let mut at = self.slot(key);
+        if self.slots[at].0 == EMPTY {
+            if self.len * 2 >= self.slots.len() {
+                let doubled = vec![(EMPTY, 0); self.slots.len() * 2];
+                let old = std::mem::replace(&mut self.slots, doubled);
+                for entry in old.into_iter().filter(|e| e.0 != EMPTY) {
+                    let to = self.slot(entry.0);
+                    self.slots[to] = entry;
+                }
+                at = self.slot(key);
+            }
+            self.slots[at] = (key, new);
+            self.len += 1;
+        }
+        self.slots[at].1
+    }
+
+    fn get(&self, key: u64) -> Option<u32> {
+        let (found, value) = self.slots[self.slot(key)];
+        (found == key).then_some(value)
+    }
+}

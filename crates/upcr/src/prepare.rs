@@ -1,0 +1,254 @@
+//! First step of the pipeline: check a cloud once, shift it to a local origin, choose the scale, downsample.
+
+use rayon::prelude::*;
+
+use crate::{
+    CloudRole, Error, PointCloud, Result,
+    cloud::{
+        Bounds, local_planes, plane_normal,
+        voxel::{Cell, VoxelGrid, count_occupied, smallest_voxel_size},
+    },
+    neighbors::KdTree,
+};
+
+/// Points that carry features: enough to describe a room, few enough to match in milliseconds.
+const FEATURE_POINTS: usize = 2500;
+/// The most points that may carry features where the user's voxel size asks for more.
+const MAX_FEATURE_POINTS: usize = 6000;
+/// Points looked at to choose the scale.
+const SCALE_SAMPLE: usize = 32_768;
+/// Neighbours of a normal where cells are too sparse to give it.
+const NORMAL_NEIGHBORS: usize = 16;
+/// Mean points a cell from which on cells give normals.
+const DENSE_CELL: f64 = 4.0;
+/// Points without which no pose is determined.
+const FEWEST_POINTS: usize = 3;
+/// Every so-many-th point is kept from the refinement and used by the verification alone.
+const HOLD_OUT_EVERY: usize = 4;
+
+/// A cloud that passed the checks, with the numbers that later steps need.
+pub(crate) struct Checked<'a> {
+    cloud: &'a PointCloud,
+    pub bounds: Bounds,
+    role: CloudRole,
+}
+
+/// A cloud at one resolution, about its local origin.
+pub(crate) struct Level {
+    pub points: Vec<[f32; 3]>,
+    /// Unit normals of arbitrary sign.
+    pub normals: Vec<[f32; 3]>,
+    pub tree: KdTree,
+    pub voxel_size: f32,
+    /// Largest distance of a point from the local origin.
+    pub radius: f32,
+}
+
+/// A cloud ready to be registered.
+pub(crate) struct Prepared {
+    /// Local coordinates are the file's minus this.
+    pub origin: [f64; 3],
+    /// Length of the bounding box's diagonal.
+    pub diagonal: f32,
+    /// Resolution of refinement and verification.
+    pub fine: Level,
+    /// Resolution of the features, where it differs from `fine` and features are wanted.
+    coarse: Option<Level>,
+}
+
+impl Prepared {
+    /// Resolution of the features.
+    pub fn coarse(&self) -> &Level {
+        self.coarse.as_ref().unwrap_or(&self.fine)
+    }
+
+    /// Indices into `fine` of the points that the refinement moves.
+    pub fn refined_points(&self) -> Vec<u32> {
+        (0..self.fine.points.len() as u32).filter(|i| !is_held_out(*i)).collect()
+    }
+
+    /// Indices into `fine` of the points that only the verification sees.
+    pub fn held_out_points(&self) -> Vec<u32> {
+        (0..self.fine.points.len() as u32).filter(|i| is_held_out(*i)).collect()
+    }
+}
+
+/// A fixed pseudo-random quarter of all indices.
+fn is_held_out(index: u32) -> bool {
+    // A stride would follow scan lines; the hash does not.
+    (index.wrapping_mul(0x9E37_79B9) >> 16) as usize % HOLD_OUT_EVERY == 0
+}
+
+/// Checks that `cloud` is finite, large enough and more than a line.
+pub(crate) fn check(cloud: &PointCloud, role: CloudRole) -> Result<Checked<'_>> {
+    let bounds = cloud.checked_bounds(role)?;
+    let (Some(bounds), FEWEST_POINTS..) = (bounds, cloud.len()) else {
+        return Err(Error::TooFewPoints { role, found: cloud.len(), needed: FEWEST_POINTS });
+    };
+    if bounds.diagonal() == 0.0 {
+        return Err(Error::Degenerate { role, reason: "all points are equal" });
+    }
+    if !bounds.diagonal().is_finite() || bounds.diagonal() > f64::from(f32::MAX).sqrt() {
+        return Err(Error::Degenerate { role, reason: "the coordinates are too far apart to compute with" });
+    }
+    if is_collinear(cloud, &bounds) {
+        return Err(Error::Degenerate { role, reason: "all points lie on one line" });
+    }
+    Ok(Checked { cloud, bounds, role })
+}
+
+/// Whether no point leaves the line through the two most distant corners of the cloud.
+fn is_collinear(cloud: &PointCloud, bounds: &Bounds) -> bool {
+    const TOLERANCE: f64 = 1e-6;
+    let first = cloud.points[0];
+    let minus = |a: [f64; 3], b: [f64; 3]| [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+    let norm_sq = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>();
+    let mut far = [0.0; 3];
+    for &p in &cloud.points {
+        let d = minus(p, first);
+        if norm_sq(d) > norm_sq(far) {
+            far = d;
+        }
+    }
+    let length_sq = norm_sq(far);
+    let limit = (TOLERANCE * bounds.diagonal()).powi(2);
+    cloud.points.iter().all(|&p| {
+        let d = minus(p, first);
+        let along = (d[0] * far[0] + d[1] * far[1] + d[2] * far[2]) / length_sq;
+        norm_sq(std::array::from_fn(|k| d[k] - along * far[k])) <= limit
+    })
+}
+
+/// The scale of both clouds: their point spacing, or coarser where that leaves more points than features need.
+pub(crate) fn derive_voxel_size(source: &Checked, target: &Checked) -> f64 {
+    let (a, b) = rayon::join(|| natural_voxel_size(source), || natural_voxel_size(target));
+    a.max(b)
+}
+
+fn natural_voxel_size(checked: &Checked) -> f64 {
+    let (points, bounds) = (&checked.cloud.points, &checked.bounds);
+    let floor = smallest_voxel_size(bounds.diagonal());
+    if points.len() <= FEATURE_POINTS {
+        return spacing(checked).max(floor);
+    }
+    let step = points.len().div_ceil(SCALE_SAMPLE);
+    let sample: Vec<_> = points.iter().step_by(step).copied().collect();
+    // Scans are surfaces: the number of occupied cells falls with the square of their size.
+    let mut coarse = bounds.diagonal() / 64.0;
+    let mut occupied = 0;
+    for _ in 0..6 {
+        occupied = count_occupied(&sample, bounds.min, coarse.max(floor)).max(1);
+        let ratio = occupied as f64 / FEATURE_POINTS as f64;
+        if (0.95..1.05).contains(&ratio) {
+            break;
+        }
+        coarse *= ratio.sqrt();
+    }
+    let spacing = coarse / (points.len() as f64 / occupied as f64).sqrt();
+    (0.5 * coarse).max(spacing).max(floor)
+}
+
+/// Typical distance between neighbouring samples, as the edge of the square that each would have to itself.
+fn spacing(checked: &Checked) -> f64 {
+    const NEIGHBORS: usize = 9;
+    let points = local_points(checked.cloud, checked.bounds.center());
+    let tree = KdTree::new(&points);
+    let graph = tree.knn_graph(NEIGHBORS);
+    let mut edges: Vec<f32> = (0..graph.len())
+        .filter_map(|i| {
+            let row = graph.row(i);
+            let last = row.last()?;
+            // πr² holds as many points as the row has, itself apart.
+            Some((std::f32::consts::PI * last.distance_sq / (row.len().max(2) - 1) as f32).sqrt())
+        })
+        .filter(|&edge| edge > 0.0)
+        .collect();
+    if edges.is_empty() {
+        return checked.bounds.diagonal() / (points.len() as f64).sqrt();
+    }
+    let middle = edges.len() / 2;
+    f64::from(*edges.select_nth_unstable_by(middle, f32::total_cmp).1)
+}
+
+fn local_points(cloud: &PointCloud, origin: [f64; 3]) -> Vec<[f32; 3]> {
+    cloud.points.iter().map(|p| std::array::from_fn(|k| (p[k] - origin[k]) as f32)).collect()
+}
+
+/// Downsamples to `voxel_size` and, where `features` are wanted, to the resolution that carries them.
+pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Result<Prepared> {
+    let (cloud, bounds) = (checked.cloud, &checked.bounds);
+    if voxel_size < smallest_voxel_size(bounds.diagonal()) {
+        return Err(Error::InvalidSetting {
+            name: "voxel_size",
+            reason: format!("{voxel_size} is too small for the {}'s extent of {}", checked.role, bounds.diagonal()),
+        });
+    }
+    let origin = bounds.center();
+    let diagonal = bounds.diagonal() as f32;
+    let corner = std::array::from_fn(|k| bounds.min[k] - origin[k]);
+    let mut grid = VoxelGrid::new(cloud.points.iter().copied(), origin, corner, voxel_size);
+    if cloud.len() <= FEATURE_POINTS && grid.cells.len() * 10 >= cloud.len() * 4 {
+        // The scale is the cloud's own spacing: keep the samples themselves.
+        let points = local_points(cloud, origin);
+        return Ok(Prepared { origin, diagonal, fine: Level::sparse(points, voxel_size), coarse: None });
+    }
+    let fine = Level::from_grid(&grid, voxel_size);
+    let mut coarse = None;
+    let mut size = voxel_size;
+    if features && grid.cells.len() > FEATURE_POINTS {
+        loop {
+            grid = grid.coarsened();
+            size *= 2.0;
+            if grid.cells.len() <= MAX_FEATURE_POINTS {
+                break;
+            }
+        }
+        coarse = Some(Level::from_grid(&grid, size));
+    }
+    Ok(Prepared { origin, diagonal, fine, coarse })
+}
+
+impl Level {
+    /// Every point as it is, normals from its nearest neighbours.
+    fn sparse(points: Vec<[f32; 3]>, voxel_size: f64) -> Self {
+        let tree = KdTree::new(&points);
+        let planes = local_planes(&points, &tree.knn_graph(NORMAL_NEIGHBORS));
+        let normals = planes.iter().map(|p| p.normal).collect();
+        Self::new(points, normals, tree, voxel_size)
+    }
+
+    /// One point a cell, normals from the points in and around it.
+    fn from_grid(grid: &VoxelGrid, voxel_size: f64) -> Self {
+        let points: Vec<[f32; 3]> = grid.cells.iter().map(|c| c.mean().map(|v| v as f32)).collect();
+        let total: f64 = grid.cells.iter().map(|c| c.count).sum();
+        if total < DENSE_CELL * points.len() as f64 {
+            return Self::sparse(points, voxel_size);
+        }
+        let (tree, normals) = rayon::join(
+            || KdTree::new(&points),
+            || {
+                (0..points.len())
+                    .into_par_iter()
+                    .with_min_len(256)
+                    .map(|i| normal_of(&grid.surroundings(i)))
+                    .collect::<Vec<_>>()
+            },
+        );
+        Self::new(points, normals, tree, voxel_size)
+    }
+
+    fn new(points: Vec<[f32; 3]>, normals: Vec<[f32; 3]>, tree: KdTree, voxel_size: f64) -> Self {
+        let radius_sq = points.iter().map(|p| p.iter().map(|v| v * v).sum::<f32>()).fold(0.0, f32::max);
+        Self { points, normals, tree, voxel_size: voxel_size as f32, radius: radius_sq.sqrt() }
+    }
+
+    /// At most `count` point indices, spread evenly over `indices`.
+    pub fn thin(indices: &[u32], count: usize) -> Vec<u32> {
+        let step = indices.len().div_ceil(count.max(1)).max(1);
+        indices.iter().step_by(step).copied().collect()
+    }
+}
+
+fn normal_of(cell: &Cell) -> [f32; 3] {
+    plane_normal(&cell.covariance())
+}

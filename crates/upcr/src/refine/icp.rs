@@ -1,0 +1,159 @@
+//! Iterative closest points, coarse to fine.
+
+use nalgebra::{Matrix6, Vector3};
+use rayon::prelude::*;
+
+use super::{
+    Factor, LockedPose, RobustKernel,
+    solver::{Correspondence, MIN_DAMPING, Objective},
+};
+use crate::{prepare::Level, transform::Rigid};
+
+/// Source points are matched in blocks of this many; the blocks' results stand in order.
+const BLOCK: usize = 256;
+/// Surfaces that face more than this far apart (cosine) are not the same surface.
+const NORMAL_COSINE: f64 = 0.5;
+
+/// How far and how long to look for correspondences.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Schedule {
+    /// Pairs further apart are no pairs: at the first iteration, and at the last.
+    pub max_distance: (f32, f32),
+    /// Iterations from the one to the other.
+    pub shrink_over: usize,
+    /// Iterations at most.
+    pub max_iterations: usize,
+    /// Share of the closest pairs that is kept.
+    pub keep: f64,
+}
+
+/// A refined pose.
+#[derive(Debug, Clone)]
+pub(crate) struct Refined {
+    pub pose: Rigid,
+    pub iterations: usize,
+    pub converged: bool,
+    /// Information about the pose (left twist about the target's local origin), per unit residual variance.
+    pub hessian: Matrix6<f64>,
+    /// Variance of a residual.
+    pub variance: f64,
+}
+
+/// Refines `pose` by moving the points `moved` of `source` onto `target`.
+#[allow(clippy::too_many_arguments)]
+pub(crate) fn refine(
+    source: &Level,
+    moved: &[u32],
+    target: &Level,
+    pose: &Rigid,
+    factor: &dyn Factor,
+    kernel: RobustKernel,
+    schedule: &Schedule,
+    lock: Option<&LockedPose>,
+) -> Refined {
+    let mut refined = Refined {
+        pose: lock.map_or(*pose, |l| l.project(pose)),
+        iterations: 0,
+        converged: false,
+        hessian: Matrix6::zeros(),
+        variance: 0.0,
+    };
+    let (first, last) = schedule.max_distance;
+    let mut damping = MIN_DAMPING;
+    for iteration in 0..schedule.max_iterations {
+        let along = (iteration as f32 / schedule.shrink_over.max(1) as f32).min(1.0);
+        let max_distance = first * (last / first).powf(along);
+        let mut pairs = correspondences(source, moved, target, &refined.pose, max_distance);
+        keep_closest(&mut pairs, &refined.pose, schedule.keep);
+        if pairs.len() < 6 {
+            refined.converged = false;
+            return refined;
+        }
+        let objective = Objective { factor, kernel, scale_sq: scale_sq(factor, &pairs, &refined.pose, max_distance) };
+        refined.iterations = iteration + 1;
+        let Some(next) = objective.step(&refined.pose, &pairs, lock, &mut damping) else {
+            refined.converged = along >= 1.0;
+            if refined.converged { break } else { continue }
+        };
+        let motion = next * refined.pose.inverse();
+        let moved_by = motion.angle() * f64::from(target.radius) + motion.translation.norm();
+        refined.pose = next;
+        if along >= 1.0 && moved_by < f64::from(1e-3 * source.voxel_size) {
+            refined.converged = true;
+            break;
+        }
+    }
+    let mut pairs = correspondences(source, moved, target, &refined.pose, last);
+    keep_closest(&mut pairs, &refined.pose, schedule.keep);
+    if pairs.len() < 6 {
+        refined.converged = false;
+        return refined;
+    }
+    let objective = Objective { factor, kernel, scale_sq: scale_sq(factor, &pairs, &refined.pose, last) };
+    let model = objective.linearize(&refined.pose, &pairs);
+    refined.hessian = model.hessian;
+    refined.variance = model.residual_sq / model.weight.max(f64::MIN_POSITIVE);
+    refined
+}
+
+/// The kernel's scale from the residuals themselves: a few robust standard deviations, within what the
+/// search radius allows.
+fn scale_sq(factor: &dyn Factor, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> f64 {
+    let plain = Objective { factor, kernel: RobustKernel::None, scale_sq: 1.0 };
+    let mut squares: Vec<f64> = pairs.iter().map(|c| plain.squared(pose, c)).collect();
+    let middle = squares.len() / 2;
+    let median_sq = *squares.select_nth_unstable_by(middle, f64::total_cmp).1;
+    // 1.4826² turns a squared median into a variance; three standard deviations.
+    let limit = f64::from(max_distance).powi(2);
+    (9.0 * 2.198 * median_sq).clamp(1e-8 * limit, limit)
+}
+
+fn keep_closest(pairs: &mut Vec<Correspondence>, pose: &Rigid, keep: f64) {
+    let kept = (pairs.len() as f64 * keep).ceil() as usize;
+    if kept == 0 || kept >= pairs.len() {
+        return;
+    }
+    let distance_sq = |c: &Correspondence| {
+        (pose.rotation * Vector3::from(c.source.map(f64::from)) + pose.translation
+            - Vector3::from(c.target.map(f64::from)))
+        .norm_squared()
+    };
+    pairs.select_nth_unstable_by(kept - 1, |a, b| distance_sq(a).total_cmp(&distance_sq(b)));
+    pairs.truncate(kept);
+}
+
+/// Pairs each point of `moved` with its nearest target point, where one is near and faces the same way.
+fn correspondences(
+    source: &Level,
+    moved: &[u32],
+    target: &Level,
+    pose: &Rigid,
+    max_distance: f32,
+) -> Vec<Correspondence> {
+    let rotation = pose.rotation.map(|v| v as f32);
+    let translation = pose.translation.map(|v| v as f32);
+    let blocks: Vec<Vec<Correspondence>> = moved
+        .par_chunks(BLOCK)
+        .map(|block| {
+            let mut found = Vec::with_capacity(block.len());
+            for &i in block {
+                let p = source.points[i as usize];
+                let y = rotation * Vector3::from(p) + translation;
+                let Some(nearest) = target.tree.nearest(y.into(), max_distance * max_distance) else { continue };
+                let (m, n) = (source.normals[i as usize], target.normals[nearest.index as usize]);
+                let cosine = f64::from((rotation * Vector3::from(m)).dot(&Vector3::from(n)));
+                if cosine.abs() < NORMAL_COSINE {
+                    continue;
+                }
+                found.push(Correspondence {
+                    source: p,
+                    target: target.points[nearest.index as usize],
+                    source_normal: m,
+                    target_normal: n,
+                });
+            }
+            found
+        })
+        .collect();
+    blocks.concat()
+}

@@ -1,0 +1,9 @@
+//! Is the pose right? Overlap on held-out points, the runner-up, conditioning, and a probability from them.
+
+mod conditioning;
+mod overlap;
+mod verdict;
+
+pub(crate) use conditioning::{covariance, weakest_direction};
+pub(crate) use overlap::{distances, symmetric_score};
+pub(crate) use verdict::{Evidence, judge};
