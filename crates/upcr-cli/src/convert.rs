@@ -7,7 +7,8 @@ use anyhow::Result;
 
 use crate::input;
 use crate::output::{Progress, note};
-use crate::pending::{cloud, io};
+use crate::pending::cloud;
+use crate::pending::io::{self, Encoding};
 
 /// Convert a cloud to another format, told by the file's extension
 #[derive(clap::Args)]
@@ -22,11 +23,24 @@ pub struct Args {
     /// Move the cloud by the pose in this text file (a 4x4 row-major matrix)
     #[arg(long, value_name = "FILE")]
     transform: Option<PathBuf>,
-    /// Write text where the format has both text and binary
-    #[arg(long)]
+    /// Write text instead of binary (PLY, PCD)
+    #[arg(long, conflicts_with = "compressed")]
     ascii: bool,
+    /// Write compressed binary (PCD)
+    #[arg(long)]
+    compressed: bool,
     #[command(flatten)]
     reading: input::Args,
+}
+
+impl Args {
+    fn encoding(&self) -> Encoding {
+        match (self.ascii, self.compressed) {
+            (true, _) => Encoding::Ascii,
+            (_, true) => Encoding::Compressed,
+            _ => Encoding::default(),
+        }
+    }
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
@@ -43,7 +57,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         points = points.transformed(&io::read_transform(path)?);
     }
     progress.step("writing");
-    io::write_cloud_with(&args.output, &points, &io::WriteOptions { ascii: args.ascii })?;
+    io::write_cloud_with(&args.output, &points, &io::WriteOptions { encoding: args.encoding() })?;
     drop(progress);
     note(&format!("{}: {} of {read} points", args.output.display(), points.len()));
     Ok(ExitCode::SUCCESS)

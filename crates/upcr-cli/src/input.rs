@@ -2,12 +2,12 @@
 
 use std::path::Path;
 
-use anyhow::anyhow;
+use anyhow::bail;
 use upcr::error::CloudRole;
 
 use upcr::{Error, PointCloud};
 
-use crate::pending::io::{self, ReadOptions};
+use crate::pending::io::{self, Intrinsics, ReadOptions};
 
 #[derive(clap::Args)]
 #[command(next_help_heading = "Reading meshes and depth images")]
@@ -15,10 +15,13 @@ pub struct Args {
     /// Points to sample from a mesh
     #[arg(long, value_name = "N", default_value_t = ReadOptions::default().mesh_samples)]
     mesh_samples: usize,
-    /// Pinhole intrinsics of a depth image, in pixels
+    /// Seed of that sampling
+    #[arg(long, value_name = "N", default_value_t = ReadOptions::default().seed)]
+    mesh_seed: u64,
+    /// Pinhole intrinsics of a depth image, in pixels [default: a Kinect's, for 640x480 images]
     #[arg(long, value_name = "FX,FY,CX,CY", value_parser = intrinsics)]
-    intrinsics: Option<[f64; 4]>,
-    /// Depth image values to one unit of length
+    intrinsics: Option<Intrinsics>,
+    /// Depth image units per metre
     #[arg(long, value_name = "N", default_value_t = ReadOptions::default().depth_scale)]
     depth_scale: f64,
 }
@@ -26,14 +29,12 @@ pub struct Args {
 impl Args {
     /// Reads the cloud at `path`.
     pub fn read(&self, path: &Path) -> Result<PointCloud, Error> {
-        let mut options = ReadOptions {
+        let options = ReadOptions {
             mesh_samples: self.mesh_samples,
+            seed: self.mesh_seed,
+            intrinsics: self.intrinsics,
             depth_scale: self.depth_scale,
-            ..ReadOptions::default()
         };
-        if self.intrinsics.is_some() {
-            options.intrinsics = self.intrinsics;
-        }
         io::read_cloud_with(path, &options)
     }
 }
@@ -54,7 +55,8 @@ pub fn name_file(error: Error, source: &Path, target: &Path) -> anyhow::Error {
     anyhow::Error::new(error).context(path)
 }
 
-fn intrinsics(text: &str) -> anyhow::Result<[f64; 4]> {
+fn intrinsics(text: &str) -> anyhow::Result<Intrinsics> {
     let values = text.split(',').map(|v| v.trim().parse()).collect::<Result<Vec<f64>, _>>()?;
-    values.try_into().map_err(|_| anyhow!("four numbers are needed"))
+    let [fx, fy, cx, cy] = values[..] else { bail!("four numbers are needed") };
+    Ok(Intrinsics { fx, fy, cx, cy })
 }

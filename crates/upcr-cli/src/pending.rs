@@ -5,25 +5,42 @@ pub mod io {
     use std::path::Path;
     use upcr::{Error, PointCloud, Result, Rigid, features::Descriptors};
 
+    #[derive(Clone, Copy)]
+    pub struct Intrinsics {
+        pub fx: f64,
+        pub fy: f64,
+        pub cx: f64,
+        pub cy: f64,
+    }
     pub struct ReadOptions {
         pub mesh_samples: usize,
-        pub intrinsics: Option<[f64; 4]>,
+        pub seed: u64,
+        pub intrinsics: Option<Intrinsics>,
         pub depth_scale: f64,
     }
     impl Default for ReadOptions {
         fn default() -> Self {
-            Self { mesh_samples: 100_000, intrinsics: None, depth_scale: 1000.0 }
+            Self { mesh_samples: 100_000, seed: 0, intrinsics: None, depth_scale: 1000.0 }
         }
     }
+    #[derive(Default)]
+    pub enum Encoding {
+        #[default]
+        Binary,
+        Ascii,
+        Compressed,
+    }
+    #[derive(Default)]
     pub struct WriteOptions {
-        pub ascii: bool,
+        pub encoding: Encoding,
     }
     fn missing<T>(path: &Path) -> Result<T> {
         std::fs::metadata(path).map_err(|source| Error::Io { path: path.into(), source })?;
         Err(Error::Unsupported { path: path.into(), reason: "not there yet".into() })
     }
     pub fn read_cloud_with(path: &Path, options: &ReadOptions) -> Result<PointCloud> {
-        let _ = (options.mesh_samples, options.intrinsics, options.depth_scale);
+        let _ = (options.mesh_samples, options.seed, options.depth_scale);
+        let _ = options.intrinsics.map(|i| (i.fx, i.fy, i.cx, i.cy));
         missing(path)
     }
     pub fn read_transform(path: &Path) -> Result<Rigid> {
@@ -36,7 +53,7 @@ pub mod io {
         missing(path)
     }
     pub fn write_cloud_with(path: &Path, cloud: &PointCloud, options: &WriteOptions) -> Result<()> {
-        let _ = options.ascii;
+        let _ = matches!(options.encoding, Encoding::Binary);
         write_cloud(path, cloud)
     }
     pub fn write_npy(path: &Path, _: &Descriptors) -> Result<()> {

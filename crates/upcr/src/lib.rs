@@ -12,3 +12,7 @@ pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
 pub use register::{Locks, Method, Reason, Refinement, Registration, Settings, Timings, register};
 pub use transform::Rigid;
+
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct Readme;
