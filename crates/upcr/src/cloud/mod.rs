@@ -4,6 +4,7 @@ mod summary;
 pub use summary::Summary;
 
 use crate::transform::Rigid;
+mod mesh;
 
 /// A point cloud in its file's own frame and unit.
 ///
