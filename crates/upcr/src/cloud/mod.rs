@@ -1,5 +1,8 @@
 //! Point clouds, meshes and what is done to them before anything else: sampling, normals, cleaning.
 
+mod normals;
+pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
+
 /// A point cloud in its file's own frame and unit.
 ///
 /// Coordinates are `f64` so that georeferenced scans (offsets of 1e6 m and more) lose nothing.
