@@ -5,6 +5,8 @@ pub use summary::Summary;
 
 use crate::transform::Rigid;
 mod mesh;
+mod normals;
+pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
 
 /// A point cloud in its file's own frame and unit.
 ///
