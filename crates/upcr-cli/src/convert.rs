@@ -7,8 +7,7 @@ use anyhow::Result;
 
 use crate::input;
 use crate::output::{Progress, note};
-use crate::pending::cloud;
-use crate::pending::io::{self, Encoding};
+use upcr::io::{self, Encoding};
 
 /// Convert a cloud to another format, told by the file's extension
 #[derive(clap::Args)]
@@ -30,7 +29,7 @@ pub struct Args {
     #[arg(long)]
     compressed: bool,
     #[command(flatten)]
-    reading: input::Args,
+    reading: input::Reading,
 }
 
 impl Args {
@@ -50,7 +49,8 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     let read = points.len();
     if let Some(size) = args.voxel_size {
         progress.step("downsampling");
-        points = cloud::voxel_downsample(&points, size)
+        points = points
+            .voxel_downsample(size)
             .map_err(|error| input::name_file(error, &args.input, &args.input))?;
     }
     if let Some(path) = &args.transform {

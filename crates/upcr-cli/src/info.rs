@@ -18,7 +18,7 @@ pub struct Args {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    reading: input::Args,
+    reading: input::Reading,
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {

@@ -4,14 +4,12 @@ use std::path::Path;
 
 use anyhow::bail;
 use upcr::error::CloudRole;
-
+use upcr::io::{self, Intrinsics, ReadOptions};
 use upcr::{Error, PointCloud};
-
-use crate::pending::io::{self, Intrinsics, ReadOptions};
 
 #[derive(clap::Args)]
 #[command(next_help_heading = "Reading meshes and depth images")]
-pub struct Args {
+pub struct Reading {
     /// Points to sample from a mesh
     #[arg(long, value_name = "N", default_value_t = ReadOptions::default().mesh_samples)]
     mesh_samples: usize,
@@ -26,7 +24,7 @@ pub struct Args {
     depth_scale: f64,
 }
 
-impl Args {
+impl Reading {
     /// Reads the cloud at `path`.
     pub fn read(&self, path: &Path) -> Result<PointCloud, Error> {
         let options = ReadOptions {

@@ -5,7 +5,6 @@ mod features;
 mod info;
 mod input;
 mod output;
-mod pending;
 mod register;
 mod synth;
 

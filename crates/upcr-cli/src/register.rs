@@ -10,8 +10,8 @@ use clap::ValueEnum;
 use upcr::{Locks, Method, Refinement, Registration, Settings};
 
 use crate::output::{self, Progress};
-use crate::pending::io;
 use crate::{NOT_REGISTERED, input};
+use upcr::io;
 
 /// Find the pose that lays SOURCE on TARGET
 #[derive(clap::Args)]
@@ -51,7 +51,7 @@ pub struct Args {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    reading: input::Args,
+    reading: input::Reading,
 }
 
 /// A degree of freedom of the pose; angles are extrinsic, about x, y and z.
@@ -86,6 +86,7 @@ impl Args {
             locks,
             seed: self.seed,
             threads: self.threads,
+            ..Settings::default()
         })
     }
 }

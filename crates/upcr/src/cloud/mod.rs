@@ -1,12 +1,13 @@
 //! Point clouds, meshes and what is done to them before anything else: sampling, normals, cleaning.
 
+mod mesh;
+mod normals;
 mod summary;
+
+pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
 pub use summary::Summary;
 
 use crate::transform::Rigid;
-mod mesh;
-mod normals;
-pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
 
 /// A point cloud in its file's own frame and unit.
 ///

@@ -3,10 +3,12 @@
 use crate::error::{Error, Result};
 use crate::neighbors::Neighborhoods;
 
+mod describe;
 mod fpfh;
 mod pair;
 mod spfh;
 
+pub use describe::{DEFAULT_K, DescribeTimings, describe};
 pub use fpfh::Fpfh;
 pub use spfh::Spfh;
 

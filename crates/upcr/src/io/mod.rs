@@ -31,6 +31,7 @@ use crate::{Error, PointCloud, Result, TriangleMesh};
 use input::{Fallible, Fault, Input, malformed, unsupported};
 use output::{Output, write_atomically};
 
+pub use npy::write_array;
 pub use transform::{read_transform, write_transform};
 
 /// A file format: its name, its extensions, and what can be done with it.

@@ -1,14 +1,15 @@
 //! NPY: an array of n rows and three or more columns, of which the first three are the position.
 
 use std::io::Write;
+use std::path::Path;
 
-use crate::PointCloud;
+use crate::{PointCloud, Result};
 
 use super::columns::{Builder, Columns};
 use super::input::{Fallible, Input, malformed, unsupported};
-use super::output::Output;
+use super::output::{Output, write_atomically};
 use super::scalar::{ByteOrder, Scalar};
-use super::{Format, ReadOptions, Reader, WriteOptions};
+use super::{Format, ReadOptions, Reader, WriteOptions, explain};
 
 pub(super) const FORMAT: Format =
     Format { name: "NPY", extensions: &["npy"], read: Reader::Cloud(read), write: Some(write) };
@@ -100,15 +101,41 @@ fn entry<'a>(header: &'a str, key: &str) -> Option<&'a str> {
 
 /// An n by 3 array of `f64`; normals, colours and viewpoint are not kept.
 fn write(out: &mut Output, cloud: &PointCloud, _: &WriteOptions) -> Fallible<()> {
-    let dict = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({}, 3), }}", cloud.len());
+    write_header(out, "<f8", [cloud.len(), 3])?;
+    for v in cloud.points.iter().flatten() {
+        out.write_all(&v.to_le_bytes())?;
+    }
+    Ok(())
+}
+
+/// Writes a rows by columns array of `f32`, such as descriptors, as a NumPy file.
+///
+/// The file appears whole or not at all.
+///
+/// # Errors
+/// [`Error::Io`](crate::Error::Io), or [`Error::Unsupported`](crate::Error::Unsupported) where the shape is not that of the values.
+pub fn write_array(path: impl AsRef<Path>, [rows, columns]: [usize; 2], values: &[f32]) -> Result<()> {
+    let path = path.as_ref();
+    let write = |out: &mut Output| {
+        if rows.checked_mul(columns) != Some(values.len()) {
+            return unsupported(format!("{} values are not {rows} rows of {columns}", values.len()));
+        }
+        write_header(out, "<f4", [rows, columns])?;
+        for v in values {
+            out.write_all(&v.to_le_bytes())?;
+        }
+        Ok(())
+    };
+    write_atomically(path, write).map_err(|fault| explain(path, FORMAT.name, fault))
+}
+
+fn write_header(out: &mut Output, dtype: &str, [rows, columns]: [usize; 2]) -> Fallible<()> {
+    let dict = format!("{{'descr': '{dtype}', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
     // The data start at a multiple of 64 bytes; magic, version and length take ten, the line's end one.
     let padded = (dict.len() + 11).next_multiple_of(64) - 11;
     out.write_all(MAGIC)?;
     out.write_all(&[1, 0])?;
     out.write_all(&(padded as u16 + 1).to_le_bytes())?;
     writeln!(out, "{dict:padded$}")?;
-    for v in cloud.points.iter().flatten() {
-        out.write_all(&v.to_le_bytes())?;
-    }
     Ok(())
 }

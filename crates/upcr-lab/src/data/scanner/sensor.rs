@@ -203,9 +203,7 @@ impl Sensor {
                 let forward = forward.normalize();
                 Matrix3::from_columns(&[right, forward.cross(&right), forward])
             }
-            Optics::Lidar(_) => {
-                Matrix3::from_columns(&[Vector3::z().cross(&right), -right, Vector3::z()])
-            }
+            Optics::Lidar(_) => Matrix3::from_columns(&[Vector3::z().cross(&right), -right, Vector3::z()]),
         };
         Rigid { rotation, translation: eye }
     }

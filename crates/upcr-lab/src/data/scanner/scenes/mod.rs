@@ -9,12 +9,12 @@ mod terrain;
 #[cfg(test)]
 pub(super) use assembly::Assembly;
 pub use object::object;
-pub use room::room;
 pub(super) use room::ROOM_SIZE_M;
+pub use room::room;
 pub use street::street;
 pub(super) use street::{LANE_M, STREET_LENGTH_M};
-pub use terrain::terrain;
 pub(super) use terrain::TERRAIN_SIZE_M;
+pub use terrain::terrain;
 
 #[cfg(test)]
 mod tests {
