@@ -4,10 +4,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
+use upcr::io::{self, Encoding};
 
 use crate::input;
 use crate::output::{Progress, note};
-use upcr::io::{self, Encoding};
 
 /// Convert a cloud to another format, told by the file's extension
 #[derive(clap::Args)]

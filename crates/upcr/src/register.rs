@@ -169,16 +169,6 @@ pub struct Registration {
     pub timings_ms: Timings,
 }
 
-impl Registration {
-    /// Least probability at which a pose counts as found.
-    pub const TRUSTWORTHY: f64 = 0.5;
-
-    /// Whether the pose is more likely right than wrong: [`Self::probability`] of at least [`Self::TRUSTWORTHY`].
-    pub fn is_trustworthy(&self) -> bool {
-        self.probability >= Self::TRUSTWORTHY
-    }
-}
-
 /// Finds the pose that lays `source` on `target`.
 pub fn register(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
     let _ = (source, target);
