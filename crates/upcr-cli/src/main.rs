@@ -1,3 +1,71 @@
-//! The command line of UPCR.
+//! The command line of UPCR: parse, call, print.
 
-fn main() {}
+mod convert;
+mod features;
+mod info;
+mod input;
+mod output;
+mod register;
+mod synth;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+/// `register` ran, but found no pose to trust.
+const NOT_REGISTERED: u8 = 3;
+
+const AFTER_HELP: &str = "\
+Exit status:
+  0  done
+  1  error: a file, a cloud or a setting is not usable; the reason is on stderr
+  2  the command line is not understood
+  3  `register` found no trustworthy pose (probability below 0.5)
+
+The answer alone goes to stdout; errors and progress go to stderr.";
+
+/// Rigid registration of point clouds
+#[derive(Parser)]
+#[command(version, after_help = AFTER_HELP)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Register(register::Args),
+    Features(features::Args),
+    Synth(synth::Args),
+    Convert(convert::Args),
+    Info(info::Args),
+}
+
+fn main() -> ExitCode {
+    let outcome = match Cli::parse().command {
+        Command::Register(args) => register::run(&args),
+        Command::Features(args) => features::run(&args),
+        Command::Synth(args) => synth::run(&args),
+        Command::Convert(args) => convert::run(&args),
+        Command::Info(args) => info::run(&args),
+    };
+    outcome.unwrap_or_else(|error| {
+        output::note(&format!("error: {}", describe(&error)));
+        ExitCode::FAILURE
+    })
+}
+
+/// The chain of causes in one line, down to the library's own error, which already tells its cause.
+fn describe(error: &anyhow::Error) -> String {
+    let mut parts = Vec::new();
+    for cause in error.chain() {
+        parts.push(cause.to_string());
+        if cause.is::<upcr::Error>() {
+            break;
+        }
+    }
+    parts.join(": ")
+}

@@ -19,3 +19,7 @@ pub use register::{
     Locks, Method, Reason, Refinement, Registration, Settings, TRUSTWORTHY, Timings, register,
 };
 pub use transform::Rigid;
+
+#[cfg(doctest)]
+#[doc = include_str!("../../../README.md")]
+struct Readme;

@@ -20,6 +20,7 @@ use crate::{
 /// Where the first pose comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
 pub enum Method {
     /// Cheap sources first, dearer ones until the verifier is sure.
     #[default]
@@ -37,6 +38,7 @@ pub enum Method {
 /// What the refinement minimises.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
 pub enum Refinement {
     /// Generalized ICP (plane to plane).
     #[default]
@@ -53,6 +55,7 @@ pub enum Refinement {
 ///
 /// Roll, pitch and yaw are the extrinsic x, y, z angles of `R = Rz(yaw) Ry(pitch) Rx(roll)`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[allow(clippy::struct_excessive_bools)]
 pub struct Locks {
     /// Rotation about x.
     pub roll: bool,
@@ -136,6 +139,19 @@ pub enum Reason {
     TooFewPoints,
     /// The refinement ran out of iterations.
     NotConverged,
+}
+
+impl std::fmt::Display for Reason {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::NoOverlap => "the clouds share no surface at the pose found",
+            Self::LowOverlap => "the clouds share little surface at the pose found",
+            Self::Ambiguous => "another, different pose explains the clouds nearly as well",
+            Self::DegenerateAxis => "some direction of motion is not held by the geometry",
+            Self::TooFewPoints => "there are too few points to tell",
+            Self::NotConverged => "the refinement ran out of iterations",
+        })
+    }
 }
 
 /// Milliseconds spent in each step; reading files is no part of it.

@@ -1,12 +1,17 @@
 //! Point clouds, meshes and what is done to them before anything else: sampling, normals, cleaning.
 
 mod bounds;
+mod mesh;
 mod normals;
+mod summary;
 pub(crate) mod voxel;
 
 pub use bounds::Bounds;
 pub(crate) use normals::plane_normal;
 pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
+pub use summary::Summary;
+
+use crate::transform::Rigid;
 
 /// A point cloud in its file's own frame and unit.
 ///
@@ -61,5 +66,42 @@ impl PointCloud {
             colors: self.colors.as_ref().map(|c| indices.iter().map(|&i| c[i]).collect()),
             viewpoint: self.viewpoint,
         }
+    }
+
+    /// The cloud moved by `pose`: positions and viewpoint as points, normals as directions.
+    #[must_use]
+    pub fn transformed(&self, pose: &Rigid) -> Self {
+        let rotation = pose.rotation.cast::<f32>();
+        let turn = |&n: &[f32; 3]| (rotation * nalgebra::Vector3::from(n)).into();
+        Self {
+            points: self.points.iter().map(|&p| pose.apply(p)).collect(),
+            normals: self.normals.as_ref().map(|n| n.iter().map(turn).collect()),
+            colors: self.colors.clone(),
+            viewpoint: self.viewpoint.map(|v| pose.apply(v)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector6;
+
+    use super::*;
+
+    #[test]
+    fn a_moved_cloud_keeps_its_normals_on_its_surface() {
+        let cloud = PointCloud {
+            points: vec![[1.0, 0.0, 0.0]],
+            normals: Some(vec![[1.0, 0.0, 0.0]]),
+            colors: Some(vec![[1, 2, 3]]),
+            viewpoint: Some([2.0, 0.0, 0.0]),
+        };
+        let quarter = Rigid::exp(&Vector6::new(0.0, 0.0, std::f64::consts::FRAC_PI_2, 0.0, 0.0, 0.0));
+        let moved = cloud.transformed(&(Rigid::from_translation([0.0, 0.0, 5.0]) * quarter));
+        let near = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-6);
+        assert!(near(moved.points[0], [0.0, 1.0, 5.0]));
+        assert!(near(moved.viewpoint.unwrap(), [0.0, 2.0, 5.0]));
+        assert!(near(moved.normals.unwrap()[0].map(f64::from), [0.0, 1.0, 0.0]));
+        assert_eq!(moved.colors, cloud.colors);
     }
 }

@@ -5,11 +5,20 @@ pub use kdtree::KdTree;
 
 /// A neighbour: its index in the indexed points and its squared distance to the query.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[repr(C, align(8))]
 pub struct Neighbor {
     /// Index into the points the index was built from.
     pub index: u32,
     /// Squared Euclidean distance.
     pub distance_sq: f32,
+}
+
+impl Neighbor {
+    /// Orders by distance, then by index: non-negative floats order as their bits do.
+    #[inline(always)]
+    pub(crate) fn rank(&self) -> u64 {
+        u64::from(self.distance_sq.to_bits()) << 32 | u64::from(self.index)
+    }
 }
 
 /// The neighbour lists of many points, one after the other (compressed rows).

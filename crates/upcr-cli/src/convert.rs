@@ -1,0 +1,64 @@
+//! `upcr convert`: from one format to another, thinned or moved on the way.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use upcr::io::{self, Encoding};
+
+use crate::input;
+use crate::output::{Progress, note};
+
+/// Convert a cloud to another format, told by the file's extension
+#[derive(clap::Args)]
+pub struct Args {
+    /// The cloud, mesh or depth image to read
+    input: PathBuf,
+    /// The cloud to write
+    output: PathBuf,
+    /// Keep one point, the mean, of every cube of this edge, in the cloud's unit
+    #[arg(long, value_name = "LENGTH", allow_negative_numbers = true)]
+    voxel_size: Option<f64>,
+    /// Move the cloud by the pose in this text file (a 4x4 row-major matrix)
+    #[arg(long, value_name = "FILE")]
+    transform: Option<PathBuf>,
+    /// Write text instead of binary (PLY, PCD)
+    #[arg(long, conflicts_with = "compressed")]
+    ascii: bool,
+    /// Write compressed binary (PCD)
+    #[arg(long)]
+    compressed: bool,
+    #[command(flatten)]
+    reading: input::Reading,
+}
+
+impl Args {
+    fn encoding(&self) -> Encoding {
+        match (self.ascii, self.compressed) {
+            (true, _) => Encoding::Ascii,
+            (_, true) => Encoding::Compressed,
+            _ => Encoding::default(),
+        }
+    }
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let mut progress = Progress::new();
+    progress.step("reading");
+    let mut points = args.reading.read(&args.input)?;
+    let read = points.len();
+    if let Some(size) = args.voxel_size {
+        progress.step("downsampling");
+        points = points
+            .voxel_downsample(size)
+            .map_err(|error| input::name_file(error, &args.input, &args.input))?;
+    }
+    if let Some(path) = &args.transform {
+        points = points.transformed(&io::read_transform(path)?);
+    }
+    progress.step("writing");
+    io::write_cloud_with(&args.output, &points, &io::WriteOptions { encoding: args.encoding() })?;
+    drop(progress);
+    note(&format!("{}: {} of {read} points", args.output.display(), points.len()));
+    Ok(ExitCode::SUCCESS)
+}

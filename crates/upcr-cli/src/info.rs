@@ -1,0 +1,54 @@
+//! `upcr info`: what a file holds.
+
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use upcr::cloud::Summary;
+
+use crate::{input, output};
+
+/// Say what a file holds
+#[derive(clap::Args)]
+pub struct Args {
+    /// The cloud, mesh or depth image to read
+    file: PathBuf,
+    /// Print one JSON object instead of lines
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    reading: input::Reading,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let summary = args.reading.read(&args.file)?.summary();
+    if args.json {
+        output::answer_json(&summary)?;
+    } else {
+        output::answer(&lines(&summary))?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn lines(summary: &Summary) -> String {
+    let triple = |v: [f64; 3]| format!("({:.6}, {:.6}, {:.6})", v[0], v[1], v[2]);
+    let yes = |has: bool| if has { "yes" } else { "no" };
+    let mut text = format!("points      {}\n", summary.points);
+    if summary.non_finite > 0 {
+        let _ = writeln!(text, "not finite  {}", summary.non_finite);
+    }
+    for (name, value) in [
+        ("minimum", summary.min),
+        ("maximum", summary.max),
+        ("extent", summary.extent),
+        ("centroid", summary.centroid),
+        ("viewpoint", summary.viewpoint),
+    ] {
+        if let Some(value) = value {
+            let _ = writeln!(text, "{name:<10}  {}", triple(value));
+        }
+    }
+    let _ = writeln!(text, "normals     {}\ncolours     {}", yes(summary.normals), yes(summary.colors));
+    text
+}

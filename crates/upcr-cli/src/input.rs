@@ -1,0 +1,60 @@
+//! The options of reading a cloud, shared by the commands.
+
+use std::path::Path;
+
+use anyhow::bail;
+use upcr::error::CloudRole;
+use upcr::io::{self, Intrinsics, ReadOptions};
+use upcr::{Error, PointCloud};
+
+#[derive(clap::Args)]
+#[command(next_help_heading = "Reading meshes and depth images")]
+pub struct Reading {
+    /// Points to sample from a mesh
+    #[arg(long, value_name = "N", default_value_t = ReadOptions::default().mesh_samples)]
+    mesh_samples: usize,
+    /// Seed of that sampling
+    #[arg(long, value_name = "N", default_value_t = ReadOptions::default().seed)]
+    mesh_seed: u64,
+    /// Pinhole intrinsics of a depth image, in pixels [default: a Kinect's, for 640x480 images]
+    #[arg(long, value_name = "FX,FY,CX,CY", value_parser = intrinsics)]
+    intrinsics: Option<Intrinsics>,
+    /// Depth image units per metre
+    #[arg(long, value_name = "N", default_value_t = ReadOptions::default().depth_scale)]
+    depth_scale: f64,
+}
+
+impl Reading {
+    /// Reads the cloud at `path`.
+    pub fn read(&self, path: &Path) -> Result<PointCloud, Error> {
+        let options = ReadOptions {
+            mesh_samples: self.mesh_samples,
+            seed: self.mesh_seed,
+            intrinsics: self.intrinsics,
+            depth_scale: self.depth_scale,
+        };
+        io::read_cloud_with(path, &options)
+    }
+}
+
+/// Tells by its file which cloud an error speaks of.
+pub fn name_file(error: Error, source: &Path, target: &Path) -> anyhow::Error {
+    let path = match &error {
+        Error::TooFewPoints { role, .. } | Error::NonFinite { role, .. } | Error::Degenerate { role, .. } => {
+            if *role == CloudRole::Target {
+                target
+            } else {
+                source
+            }
+        }
+        _ => return error.into(),
+    };
+    let path = path.display().to_string();
+    anyhow::Error::new(error).context(path)
+}
+
+fn intrinsics(text: &str) -> anyhow::Result<Intrinsics> {
+    let values = text.split(',').map(|v| v.trim().parse()).collect::<Result<Vec<f64>, _>>()?;
+    let [fx, fy, cx, cy] = values[..] else { bail!("four numbers are needed") };
+    Ok(Intrinsics { fx, fy, cx, cy })
+}

@@ -1,0 +1,170 @@
+//! `upcr register`: two clouds in, a pose and a verdict out.
+
+use std::fmt::Write;
+use std::num::NonZeroUsize;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::Result;
+use clap::ValueEnum;
+use upcr::{Locks, Method, Refinement, Registration, Settings};
+
+use crate::output::{self, Progress};
+use crate::{NOT_REGISTERED, input};
+use upcr::io;
+
+/// Find the pose that lays SOURCE on TARGET
+#[derive(clap::Args)]
+pub struct Args {
+    /// The cloud that is moved
+    source: PathBuf,
+    /// The cloud that stays
+    target: PathBuf,
+    /// Where the first pose comes from
+    #[arg(long, value_enum, default_value_t = Settings::default().method)]
+    method: Method,
+    /// What the refinement minimises
+    #[arg(long, value_enum, default_value_t = Settings::default().refine)]
+    refine: Refinement,
+    /// The one scale that drives every radius, in the clouds' unit [default: derived from the clouds]
+    #[arg(long, value_name = "LENGTH", allow_negative_numbers = true)]
+    voxel_size: Option<f64>,
+    /// A first guess of the pose: a text file with a 4x4 row-major matrix, source to target
+    #[arg(long, value_name = "FILE")]
+    init: Option<PathBuf>,
+    /// Degrees of freedom that keep their value in the first guess, e.g. `roll,pitch,z`
+    #[arg(long, value_name = "AXES", value_enum, value_delimiter = ',')]
+    lock: Vec<Axis>,
+    /// Seed of every random choice
+    #[arg(long, default_value_t = Settings::default().seed)]
+    seed: u64,
+    /// Threads to use; the result does not depend on it [default: all]
+    #[arg(long)]
+    threads: Option<NonZeroUsize>,
+    /// Write the source, moved onto the target
+    #[arg(short, long, value_name = "CLOUD")]
+    output: Option<PathBuf>,
+    /// Write the pose as a text file with a 4x4 row-major matrix
+    #[arg(long, value_name = "FILE")]
+    transform: Option<PathBuf>,
+    /// Print one JSON object instead of a summary
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    reading: input::Reading,
+}
+
+/// A degree of freedom of the pose; angles are extrinsic, about x, y and z.
+#[derive(Clone, Copy, ValueEnum)]
+enum Axis {
+    Roll,
+    Pitch,
+    Yaw,
+    X,
+    Y,
+    Z,
+}
+
+impl Args {
+    fn settings(&self) -> Result<Settings> {
+        let mut locks = Locks::default();
+        for axis in &self.lock {
+            *match axis {
+                Axis::Roll => &mut locks.roll,
+                Axis::Pitch => &mut locks.pitch,
+                Axis::Yaw => &mut locks.yaw,
+                Axis::X => &mut locks.x,
+                Axis::Y => &mut locks.y,
+                Axis::Z => &mut locks.z,
+            } = true;
+        }
+        Ok(Settings {
+            method: self.method,
+            refine: self.refine,
+            voxel_size: self.voxel_size,
+            init: self.init.as_deref().map(io::read_transform).transpose()?,
+            locks,
+            seed: self.seed,
+            threads: self.threads,
+            ..Settings::default()
+        })
+    }
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    let settings = args.settings()?;
+    let mut progress = Progress::new();
+    progress.step("reading");
+    let source = args.reading.read(&args.source)?;
+    let target = args.reading.read(&args.target)?;
+    progress.step("registering");
+    let found = upcr::register(&source, &target, &settings)
+        .map_err(|error| input::name_file(error, &args.source, &args.target))?;
+    progress.step("writing");
+    if let Some(path) = &args.transform {
+        io::write_transform(path, &found.T_target_source)?;
+    }
+    if let Some(path) = &args.output {
+        io::write_cloud(path, &source.transformed(&found.T_target_source))?;
+    }
+    drop(progress);
+
+    let trusted = found.is_trustworthy();
+    for path in [&args.transform, &args.output].into_iter().flatten().filter(|_| !trusted) {
+        output::note(&format!("warning: {}: written with a pose that is not trustworthy", path.display()));
+    }
+    if args.json {
+        output::answer_json(&found)?;
+    } else {
+        output::answer(&summary(&found, &args.source, &args.target))?;
+    }
+    Ok(if trusted { ExitCode::SUCCESS } else { ExitCode::from(NOT_REGISTERED) })
+}
+
+fn summary(found: &Registration, source: &Path, target: &Path) -> String {
+    let pose = &found.T_target_source;
+    let mut text = format!("{} -> {}\n\nT_target_source\n", source.display(), target.display());
+    for [a, b, c, t] in pose.to_rows() {
+        let _ = writeln!(text, "  {a:>10.6} {b:>10.6} {c:>10.6} {t:>15.6}");
+    }
+
+    let rotation = pose.log().fixed_rows::<3>(0).into_owned();
+    let angle = rotation.norm();
+    let _ = write!(text, "\nrotation     {:.4}°", angle.to_degrees());
+    if angle > 0.0 {
+        let axis = rotation / angle;
+        let _ = write!(text, " about ({:.4}, {:.4}, {:.4})", axis[0], axis[1], axis[2]);
+    }
+    let t = pose.translation;
+    let _ = writeln!(text, "\ntranslation  ({:.6}, {:.6}, {:.6}), length {:.6}", t[0], t[1], t[2], t.norm());
+
+    let p = found.probability;
+    let _ = if found.is_trustworthy() {
+        writeln!(text, "verdict      registered: the pose is right with probability {p:.3}")
+    } else {
+        writeln!(text, "verdict      not registered: the pose is right with a probability of only {p:.3}")
+    };
+    for reason in &found.reasons {
+        let _ = writeln!(text, "caveat       {reason}");
+    }
+    let _ = writeln!(
+        text,
+        "fitness      {:.4} ({} points within one voxel of the target, rmse {:.6})",
+        found.fitness, found.num_inliers, found.inlier_rmse
+    );
+    let _ = writeln!(
+        text,
+        "refinement   {} after {} iterations",
+        if found.converged { "converged" } else { "not converged" },
+        found.iterations
+    );
+    let from = if found.settings.voxel_size.is_some() { "given" } else { "derived from the clouds" };
+    let _ = writeln!(text, "voxel size   {:.6} ({from})", found.voxel_size);
+    let ms = &found.timings_ms;
+    let _ = writeln!(
+        text,
+        "time         {:.1} ms (prepare {:.1}, hypotheses {:.1}, refine {:.1}, verify {:.1}), reading not counted",
+        ms.total, ms.prepare, ms.hypotheses, ms.refine, ms.verify
+    );
+    text
+}

@@ -1,0 +1,125 @@
+//! The commands beside `register`.
+
+use crate::{Scratch, sample, surface, upcr};
+
+#[test]
+fn info_says_what_a_file_holds() {
+    let scratch = Scratch::new();
+    let file = scratch.xyz("cloud.xyz", &surface(10, 2.0));
+    let run = upcr(["info", &file, "--json"]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let answer = run.json();
+    assert_eq!(answer["points"], 100);
+    assert_eq!(answer["non_finite"], 0);
+    assert_eq!(answer["normals"], false);
+    assert_eq!(answer["min"][0], 0.0);
+    assert_eq!(answer["extent"][1], 2.0);
+    let lines = upcr(["info", &file]).stdout;
+    assert!(lines.contains("points      100\n"), "{lines}");
+}
+
+#[test]
+fn convert_keeps_the_points() {
+    let scratch = Scratch::new();
+    let points = surface(10, 2.0);
+    let xyz = scratch.xyz("cloud.xyz", &points);
+    for (name, option) in
+        [("a.ply", None), ("b.ply", Some("--ascii")), ("c.pcd", None), ("d.pcd", Some("--compressed"))]
+    {
+        let there = scratch.path(name);
+        let run = upcr(["convert", &xyz, &there].into_iter().chain(option));
+        assert_eq!((run.status, run.stdout.as_str()), (0, ""), "{}", run.stderr);
+        let info = upcr(["info", &there, "--json"]).json();
+        assert_eq!(info["points"], 100, "{name}");
+        assert!(
+            (info["extent"][2].as_f64().unwrap()
+                - upcr(["info", &xyz, "--json"]).json()["extent"][2].as_f64().unwrap())
+            .abs()
+                < 1e-5
+        );
+    }
+    let text = std::fs::read(scratch.path("b.ply")).unwrap();
+    assert!(text.starts_with(b"ply\nformat ascii"));
+}
+
+#[test]
+fn convert_thins_and_moves() {
+    let scratch = Scratch::new();
+    let xyz = scratch.xyz("cloud.xyz", &surface(50, 1.0));
+    let pose = scratch.file("T.txt", "1 0 0 10\n0 1 0 0\n0 0 1 0\n0 0 0 1\n");
+    let there = scratch.path("thin.ply");
+    let run = upcr(["convert", &xyz, &there, "--voxel-size", "0.1", "--transform", &pose]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let info = upcr(["info", &there, "--json"]).json();
+    let points = info["points"].as_u64().unwrap();
+    assert!((100..2500).contains(&points), "{points} points");
+    assert!(info["min"][0].as_f64().unwrap() >= 10.0);
+}
+
+#[test]
+fn features_are_one_row_a_point() {
+    let scratch = Scratch::new();
+    let cloud = scratch.xyz("cloud.xyz", &surface(20, 1.0));
+    for kind in ["distance", "ppf", "spfh", "pfh", "fpfh"] {
+        let npy = scratch.path(&format!("{kind}.npy"));
+        let run = upcr(["features", &cloud, "--kind", kind, "-o", &npy, "--json"]);
+        assert_eq!(run.status, 0, "{}", run.stderr);
+        let answer = run.json();
+        assert_eq!(answer["points"], 400);
+        assert_eq!(answer["kind"], kind);
+        let dim = answer["dim"].as_u64().unwrap();
+        assert!(dim > 0);
+        for key in ["neighbors", "normals", "feature", "total"] {
+            assert!(answer["timings_ms"][key].is_f64(), "timings_ms.{key}");
+        }
+        let bytes = std::fs::read(&npy).unwrap();
+        assert_eq!(&bytes[..6], b"\x93NUMPY");
+        let header = String::from_utf8_lossy(&bytes[10..200.min(bytes.len())]).into_owned();
+        assert!(header.contains(&format!("(400, {dim})")), "{header}");
+        assert_eq!(bytes.len() % 64, (400 * dim as usize * 4) % 64);
+    }
+}
+
+#[test]
+fn features_refuse_what_has_none() {
+    let scratch = Scratch::new();
+    let one = scratch.xyz("one.xyz", &[[0.0; 3]]);
+    let npy = scratch.path("out.npy");
+    upcr(["features", &one, "--kind", "fpfh", "-o", &npy]).assert_fails(1, &["one.xyz"]);
+    for (option, value) in [("-k", "0"), ("--radius", "-1"), ("--radius", "nan")] {
+        let run = upcr(["features", &sample("source.ply"), "--kind", "fpfh", "-o", &npy, option, value]);
+        run.assert_fails(1, &["setting"]);
+    }
+    assert_eq!(scratch.names(), ["one.xyz"]);
+}
+
+#[test]
+fn synth_writes_scans_that_register_to_their_poses() {
+    let scratch = Scratch::new();
+    let (once, twice) = (scratch.path("once"), scratch.path("twice"));
+    for out in [&once, &twice] {
+        let run = upcr(["synth", "--scans", "2", "--seed", "3", "--out", out]);
+        assert_eq!(run.status, 0, "{}", run.stderr);
+        for file in run.stdout.lines() {
+            assert!(std::path::Path::new(file).is_file(), "{file}");
+        }
+    }
+    // The same seed, the same bytes.
+    for entry in std::fs::read_dir(&once).unwrap() {
+        let path = entry.unwrap().path();
+        let twin = std::path::Path::new(&twice).join(path.file_name().unwrap());
+        assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(twin).unwrap(), "{}", path.display());
+    }
+}
+
+#[test]
+fn help_tells_the_exit_statuses() {
+    let run = upcr(["--help"]);
+    assert_eq!((run.status, run.stderr.as_str()), (0, ""));
+    assert!(run.stdout.contains("Exit status"), "{}", run.stdout);
+    for command in ["register", "features", "synth", "convert", "info"] {
+        assert!(run.stdout.contains(command));
+        assert_eq!(upcr([command, "--help"]).status, 0);
+    }
+    assert_eq!(upcr(["--version"]).stdout, concat!("upcr ", env!("CARGO_PKG_VERSION"), "\n"));
+}

@@ -1,0 +1,186 @@
+//! `upcr register` on clouds that can be registered.
+
+use serde_json::Value;
+
+use crate::{Scratch, command, numbers, sample, surface, upcr};
+
+/// Rotation error in degrees and translation error of the row-major 4x4 `found` against `truth`.
+fn pose_error(found: &[f64], truth: &[f64]) -> (f64, f64) {
+    let trace: f64 = (0..3).flat_map(|r| (0..3).map(move |c| 4 * r + c)).map(|i| found[i] * truth[i]).sum();
+    let offset: f64 = [3, 7, 11].iter().map(|&i| (found[i] - truth[i]).powi(2)).sum();
+    (((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees(), offset.sqrt())
+}
+
+fn matrix(value: &Value) -> Vec<f64> {
+    let rows = value.as_array().expect("a matrix is a list of rows");
+    assert_eq!(rows.len(), 4);
+    rows.iter()
+        .flat_map(|row| {
+            let row = row.as_array().expect("a row is a list");
+            assert_eq!(row.len(), 4);
+            row.iter().map(|v| v.as_f64().expect("an entry is a number"))
+        })
+        .collect()
+}
+
+#[test]
+fn the_sample_pair_is_laid_on_its_truth() {
+    let run = upcr(["register", &sample("source.ply"), &sample("target.ply"), "--json"]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    assert_eq!(run.stderr, "");
+    let answer = run.json();
+    let truth = numbers(sample("T_target_source.txt"));
+    let (degrees, offset) = pose_error(&matrix(&answer["T_target_source"]), &truth);
+    let voxel = answer["voxel_size"].as_f64().unwrap();
+    assert!(degrees < 1.0 && offset < 2.0 * voxel, "off by {degrees}° and {offset} (voxel size {voxel})");
+}
+
+#[test]
+fn json_is_one_complete_object() {
+    let run = upcr(["register", &sample("source.ply"), &sample("target.ply"), "--json", "--seed", "7"]);
+    let answer = run.json();
+    for key in ["fitness", "inlier_rmse", "probability", "voxel_size"] {
+        assert!(answer[key].is_f64(), "{key}: {}", answer[key]);
+    }
+    for key in ["num_inliers", "iterations"] {
+        assert!(answer[key].is_u64(), "{key}: {}", answer[key]);
+    }
+    assert_eq!(matrix(&answer["T_target_source"])[12..], [0.0, 0.0, 0.0, 1.0]);
+    assert!(answer["converged"].is_boolean());
+    assert!(answer["reasons"].is_array());
+    assert!(answer["method"].is_string());
+    assert_eq!(answer["covariance"].as_array().map(Vec::len), Some(6));
+    assert_eq!(answer["settings"]["seed"], 7);
+    for key in ["method", "refine", "voxel_size", "init", "locks", "threads"] {
+        assert!(answer["settings"].get(key).is_some(), "settings lacks {key}");
+    }
+    for key in ["prepare", "hypotheses", "refine", "verify", "total"] {
+        assert!(answer["timings_ms"][key].is_f64(), "timings_ms.{key}: {}", answer["timings_ms"][key]);
+    }
+}
+
+#[test]
+fn the_summary_says_what_the_json_says() {
+    let run = upcr(["register", &sample("source.ply"), &sample("target.ply")]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    for word in
+        ["T_target_source", "rotation", "translation", "verdict", "probability", "rmse", "voxel size", "time"]
+    {
+        assert!(run.stdout.contains(word), "`{word}` is missing in:\n{}", run.stdout);
+    }
+}
+
+#[test]
+fn the_answer_does_not_depend_on_the_threads() {
+    let pose = |threads| {
+        let run =
+            upcr(["register", &sample("source.ply"), &sample("target.ply"), "--json", "--threads", threads]);
+        matrix(&run.json()["T_target_source"])
+    };
+    assert_eq!(pose("1"), pose("2"));
+}
+
+#[test]
+fn the_outputs_hold_the_pose_and_the_moved_source() {
+    let scratch = Scratch::new();
+    let (cloud, pose) = (scratch.path("aligned.ply"), scratch.path("T.txt"));
+    let run = upcr([
+        "register",
+        &sample("source.ply"),
+        &sample("target.ply"),
+        "--json",
+        "-o",
+        &cloud,
+        "--transform",
+        &pose,
+    ]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    assert_eq!(scratch.names(), ["T.txt", "aligned.ply"]);
+    let found = matrix(&run.json()["T_target_source"]);
+    assert_eq!(numbers(&pose), found);
+
+    // What was written is read again: the moved source lies where it is, and the pose is a good first guess.
+    let again = upcr(["register", &cloud, &sample("target.ply"), "--json"]);
+    let identity: Vec<f64> = (0..16).map(|i| f64::from(u8::from(i % 5 == 0))).collect();
+    let (degrees, offset) = pose_error(&matrix(&again.json()["T_target_source"]), &identity);
+    let voxel = again.json()["voxel_size"].as_f64().unwrap();
+    assert!(degrees < 1.0 && offset < 2.0 * voxel, "off by {degrees}° and {offset}");
+    let guided = upcr([
+        "register",
+        &sample("source.ply"),
+        &sample("target.ply"),
+        "--method",
+        "prior",
+        "--init",
+        &pose,
+        "--json",
+    ]);
+    assert_eq!(guided.status, 0, "{}", guided.stderr);
+    assert_eq!(guided.json()["method"], "prior");
+}
+
+#[test]
+fn locked_axes_keep_their_value() {
+    let scratch = Scratch::new();
+    let cloud = surface(40, 1.0);
+    let target = scratch.xyz("target.xyz", &cloud);
+    let moved: Vec<_> = cloud.iter().map(|p| [p[0] + 0.01, p[1] - 0.01, p[2] + 0.01]).collect();
+    let source = scratch.xyz("source.xyz", &moved);
+    let run = upcr([
+        "register",
+        &source,
+        &target,
+        "--method",
+        "prior",
+        "--lock",
+        "roll,pitch,yaw",
+        "--lock",
+        "z",
+        "--json",
+    ]);
+    let answer = run.json();
+    let locks = &answer["settings"]["locks"];
+    for (axis, locked) in
+        [("roll", true), ("pitch", true), ("yaw", true), ("x", false), ("y", false), ("z", true)]
+    {
+        assert_eq!(locks[axis], locked, "{axis}");
+    }
+    let pose = matrix(&answer["T_target_source"]);
+    assert_eq!([&pose[..3], &pose[4..7], &pose[8..12]].concat(), [1., 0., 0., 0., 1., 0., 0., 0., 1., 0.]);
+}
+
+#[test]
+fn disjoint_clouds_are_not_registered() {
+    let scratch = Scratch::new();
+    let source = scratch.xyz("source.xyz", &surface(40, 1.0));
+    let away: Vec<_> = surface(40, 1.0).iter().map(|p| [p[0] + 1000.0, p[1], p[2]]).collect();
+    let target = scratch.xyz("target.xyz", &away);
+    let pose = scratch.path("T.txt");
+    let run = upcr(["register", &source, &target, "--method", "prior", "--json", "--transform", &pose]);
+    assert_eq!(run.status, 3, "{}", run.stderr);
+    let answer = run.json();
+    assert_eq!(answer["converged"], false);
+    assert_eq!(answer["num_inliers"], 0);
+    assert!(answer["probability"].as_f64().unwrap() < 0.5);
+    assert!(!answer["reasons"].as_array().unwrap().is_empty());
+    // Written all the same, and said so.
+    assert_eq!(numbers(&pose).len(), 16);
+    assert!(run.stderr.contains("not trustworthy"), "{}", run.stderr);
+}
+
+/// A reader that hangs up before the answer comes once ended programs with a panic.
+#[cfg(unix)]
+#[test]
+fn a_closed_pipe_is_no_panic() {
+    use std::process::Stdio;
+    let mut child = command()
+        .args(["register", &sample("source.ply"), &sample("target.ply")])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    drop(child.stdout.take());
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(0));
+    assert_eq!(output.stderr, b"");
+}

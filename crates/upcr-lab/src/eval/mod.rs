@@ -1,0 +1,3 @@
+//! How estimated poses are judged.
+
+pub mod metrics;
