@@ -1,7 +1,11 @@
 //! Point clouds, meshes and what is done to them before anything else: sampling, normals, cleaning.
 
 mod normals;
+mod outliers;
+mod sample;
 pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
+pub use outliers::statistical_inliers;
+pub use sample::{farthest_points, random_indices};
 
 /// A point cloud in its file's own frame and unit.
 ///
