@@ -3,12 +3,16 @@
 mod bounds;
 mod mesh;
 mod normals;
+mod outliers;
+mod sample;
 mod summary;
 pub(crate) mod voxel;
 
 pub use bounds::Bounds;
 pub(crate) use normals::plane_normal;
 pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
+pub use outliers::statistical_inliers;
+pub use sample::{farthest_points, random_indices};
 pub use summary::Summary;
 
 use crate::transform::Rigid;

@@ -4,12 +4,19 @@ use crate::error::{Error, Result};
 use crate::neighbors::Neighborhoods;
 
 mod describe;
+mod distance;
+mod edges;
 mod fpfh;
 mod pair;
+mod pfh;
+mod ppf;
 mod spfh;
 
 pub use describe::{DEFAULT_K, DescribeTimings, describe};
+pub use distance::Distance;
 pub use fpfh::Fpfh;
+pub use pfh::Pfh;
+pub use ppf::Ppf;
 pub use spfh::Spfh;
 
 /// A descriptor of the surface about a point that does not change with the cloud's pose.
@@ -28,7 +35,7 @@ pub trait Feature: Send + Sync {
 }
 
 /// Every feature there is.
-pub const ALL: &[&dyn Feature] = &[&Spfh, &Fpfh];
+pub const ALL: &[&dyn Feature] = &[&Distance, &Ppf, &Spfh, &Pfh, &Fpfh];
 
 /// The feature of that name.
 pub fn by_name(name: &str) -> Option<&'static dyn Feature> {
@@ -84,5 +91,57 @@ impl Descriptors {
     /// Row `i`.
     pub fn row(&self, i: usize) -> &[f32] {
         &self.values[i * self.dim..(i + 1) * self.dim]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::neighbors::KdTree;
+
+    const POINTS: [[f32; 3]; 4] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]];
+    const NORMALS: [[f32; 3]; 4] = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]];
+
+    #[test]
+    fn dimensions_are_as_announced_and_names_unique() {
+        let neighborhoods = KdTree::new(&POINTS).knn_graph(3);
+        let input = FeatureInput { points: &POINTS, normals: &NORMALS, neighborhoods: &neighborhoods };
+        for feature in ALL {
+            let found = feature.compute(&input).unwrap();
+            assert_eq!((found.dim, found.len()), (feature.dim(3), 4), "{}", feature.name());
+            assert!(found.values.iter().all(|v| v.is_finite()), "{}", feature.name());
+            assert_eq!(by_name(feature.name()).map(|f| f.name()), Some(feature.name()));
+        }
+    }
+
+    #[test]
+    fn missing_normals_are_an_error() {
+        let neighborhoods = KdTree::new(&POINTS).knn_graph(3);
+        let input = FeatureInput { points: &POINTS, normals: &[], neighborhoods: &neighborhoods };
+        for feature in ALL {
+            assert_eq!(feature.compute(&input).is_err(), feature.needs_normals(), "{}", feature.name());
+        }
+    }
+
+    #[test]
+    fn an_empty_cloud_has_no_descriptors() {
+        let neighborhoods = Neighborhoods::default();
+        let input = FeatureInput { points: &[], normals: &[], neighborhoods: &neighborhoods };
+        assert!(ALL.iter().all(|feature| feature.compute(&input).unwrap().is_empty()));
+    }
+
+    #[test]
+    fn edges_carry_the_defined_values_and_short_rows_repeat_the_last() {
+        let neighborhoods = KdTree::new(&POINTS).radius_graph(1.5, 10);
+        let input = FeatureInput { points: &POINTS, normals: &NORMALS, neighborhoods: &neighborhoods };
+        let ppf = Ppf.compute(&input).unwrap();
+        let right = std::f32::consts::FRAC_PI_2;
+        // Point 0: itself, its duplicate, point 1.
+        assert_eq!(ppf.row(0), [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, right, 0.0, right]);
+        assert_eq!(ppf.row(2), [0.0; 12]);
+
+        let distance = Distance.compute(&input).unwrap();
+        let (o0, o1) = (0.3125_f32.sqrt(), 0.8125_f32.sqrt());
+        assert_eq!(distance.row(0), [o0, 0.0, o0, o0, 0.0, o0, o1, 1.0, o0]);
     }
 }

@@ -56,9 +56,9 @@ pub(super) fn histograms(input: &FeatureInput) -> Vec<[f32; DIM]> {
 fn histogram(input: &FeatureInput, i: usize, bins: &AngleBins<BINS>) -> [f32; DIM] {
     let center = Points::splat(input.points[i], input.normals[i]);
     let mut counts = [[0_u32; BINS + 1]; 3];
-    // The query itself, at distance zero, makes no pair: no need to leave it out.
     for batch in input.neighborhoods.row(i).chunks(LANES) {
-        let mut others = Points::ZERO;
+        // The point makes no pair with itself: no need to leave it out, and it fills the last batch.
+        let mut others = center;
         for (l, &Neighbor { index, .. }) in batch.iter().enumerate() {
             others.set(l, input.points[index as usize], input.normals[index as usize]);
         }

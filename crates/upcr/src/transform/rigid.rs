@@ -1,6 +1,6 @@
 //! A rotation and a translation in double precision.
 
-use nalgebra::{Matrix3, Matrix4, Rotation3, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix4, Rotation3, UnitQuaternion, Vector3, Vector6};
 use serde::{Serialize, Serializer};
 
 /// A rigid motion `y = R x + t`.
@@ -82,7 +82,9 @@ impl Rigid {
 
     /// The twist whose exponential this is, rotation vector of length at most π.
     pub fn log(&self) -> Vector6<f64> {
-        let omega = Rotation3::from_matrix_unchecked(self.rotation).scaled_axis();
+        // By way of the quaternion, which keeps its accuracy at angle π.
+        let rotation = Rotation3::from_matrix_unchecked(self.rotation);
+        let omega = UnitQuaternion::from_rotation_matrix(&rotation).scaled_axis();
         let v = left_jacobian(&omega).try_inverse().unwrap_or_else(Matrix3::identity) * self.translation;
         Vector6::new(omega[0], omega[1], omega[2], v[0], v[1], v[2])
     }
@@ -132,4 +134,82 @@ fn left_jacobian(omega: &Vector3<f64>) -> Matrix3<f64> {
         ((1.0 - angle.cos()) / angle_sq, (angle - angle.sin()) / (angle_sq * angle))
     };
     Matrix3::identity() + hat * a + hat * hat * b
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Motions with every size of rotation, 0 and π and their surroundings among them.
+    fn twists() -> impl Strategy<Value = Vector6<f64>> {
+        let angle = prop_oneof![
+            Just(0.0),
+            Just(PI),
+            (-16.0_f64..-1.0).prop_map(|e| 10_f64.powf(e)),
+            (-16.0_f64..-1.0).prop_map(|e| PI - 10_f64.powf(e)),
+            0.0..PI,
+        ];
+        let vector = || prop::array::uniform3(-1.0_f64..1.0).prop_map(Vector3::from);
+        (angle, vector(), vector()).prop_filter_map("no axis", |(angle, axis, v)| {
+            let omega = axis.try_normalize(1e-3)? * angle;
+            Some(Vector6::new(omega[0], omega[1], omega[2], 5.0 * v[0], 5.0 * v[1], 5.0 * v[2]))
+        })
+    }
+
+    fn distance(a: &Rigid, b: &Rigid) -> f64 {
+        (a.rotation - b.rotation).amax().max((a.translation - b.translation).amax())
+    }
+
+    proptest! {
+        #[test]
+        fn logarithm_undoes_exponential(twist in twists()) {
+            let motion = Rigid::exp(&twist);
+            let log = motion.log();
+            prop_assert!(log.fixed_rows::<3>(0).norm() <= PI + 1e-12);
+            prop_assert!(distance(&Rigid::exp(&log), &motion) < 1e-12);
+            // At π the axis has two signs.
+            if twist.fixed_rows::<3>(0).norm() < 3.1 {
+                prop_assert!((log - twist).amax() < 1e-11);
+            }
+        }
+
+        #[test]
+        fn angle_is_the_twist_s(twist in twists()) {
+            prop_assert!((Rigid::exp(&twist).angle() - twist.fixed_rows::<3>(0).norm()).abs() < 1e-12);
+        }
+
+        #[test]
+        fn motions_form_a_group(a in twists(), b in twists(), x in prop::array::uniform3(-9.0_f64..9.0)) {
+            let (a, b) = (Rigid::exp(&a), Rigid::exp(&b));
+            prop_assert!(distance(&(a * a.inverse()), &Rigid::identity()) < 1e-12);
+            prop_assert!(distance(&(a * b).inverse(), &(b.inverse() * a.inverse())) < 1e-12);
+            let (chained, composed) = (a.apply(b.apply(x)), (a * b).apply(x));
+            prop_assert!((0..3).all(|i| (chained[i] - composed[i]).abs() < 1e-12));
+            prop_assert!((a.rotation.determinant() - 1.0).abs() < 1e-12);
+        }
+
+        #[test]
+        fn rows_come_back(twist in twists()) {
+            let motion = Rigid::exp(&twist);
+            prop_assert!(distance(&Rigid::from_rows(&motion.to_rows()).unwrap(), &motion) < 1e-12);
+        }
+    }
+
+    #[test]
+    fn rows_that_are_no_motion_are_refused() {
+        let refused = |change: fn(&mut [[f64; 4]; 4])| {
+            let mut rows = Rigid::identity().to_rows();
+            change(&mut rows);
+            Rigid::from_rows(&rows).is_err()
+        };
+        assert!(refused(|m| m[0][3] = f64::NAN));
+        assert!(refused(|m| m[3][0] = 1.0));
+        assert!(refused(|m| m[1][1] = 2.0));
+        assert!(refused(|m| m[2][2] = -1.0));
+        assert!(!refused(|m| m[0][1] = 1e-6));
+    }
 }
