@@ -173,11 +173,14 @@ mod tests {
     fn distance_is_the_root_mean_square_displacement() {
         let mut rng = random::stream(2, 0);
         let points: Vec<[f64; 3]> = (0..50)
-            .map(|_| Vector3::new(2.0, 1.0, 0.2).component_mul(&random::direction(&mut rng)).add_scalar(3.0).into())
+            .map(|_| {
+                Vector3::new(2.0, 1.0, 0.2).component_mul(&random::direction(&mut rng)).add_scalar(3.0).into()
+            })
             .collect();
         let a = Rigid { translation: Vector3::new(0.3, -0.2, 0.1), ..about([1.0, 0.2, 0.4], 40.0) };
         let b = Rigid { translation: Vector3::new(-0.1, 0.5, 0.0), ..about([-1.0, 0.7, 0.1], 75.0) };
-        let displacement = |&p: &[f64; 3]| (Vector3::from(a.apply(p)) - Vector3::from(b.apply(p))).norm_squared();
+        let displacement =
+            |&p: &[f64; 3]| (Vector3::from(a.apply(p)) - Vector3::from(b.apply(p))).norm_squared();
         let expected = (points.iter().map(displacement).sum::<f64>() / 50.0).sqrt();
         let spread = ShapeSpread::of(&points);
         assert!((spread.distance(&a, &b) - expected).abs() < 1e-9);

@@ -199,9 +199,10 @@ pub fn synth(settings: &SynthSettings) -> Result<Vec<Scan>> {
     let mut turns = stream(settings.seed, Stream::Turn);
     let mut noise_seeds = stream(settings.seed, Stream::Noise);
     let scan = |(k, pose): (usize, &Rigid)| {
-        let overlaps = poses.iter().enumerate().map(|(other, second)| {
-            if other == k { 1.0 } else { cast::overlap(&bvh, sensor, pose, second) }
-        });
+        let overlaps = poses
+            .iter()
+            .enumerate()
+            .map(|(other, second)| if other == k { 1.0 } else { cast::overlap(&bvh, sensor, pose, second) });
         let overlaps = overlaps.collect();
         let points = cast::scan(&bvh, sensor, pose, noise_seeds.random());
         if points.is_empty() {
@@ -230,12 +231,7 @@ fn stream(seed: u64, purpose: Stream) -> impl Rng {
 /// The way the sensor takes through a scene.
 fn path(settings: &SynthSettings, mesh: &TriangleMesh) -> Path {
     let phase = stream(settings.seed, Stream::Path).random_range(0.0..TAU);
-    let level = |half_axes, height, course| Path {
-        center: Vector3::z() * height,
-        half_axes,
-        phase,
-        course,
-    };
+    let level = |half_axes, height, course| Path { center: Vector3::z() * height, half_axes, phase, course };
     match &settings.scene {
         Scene::Object | Scene::Mesh(_) => {
             let Sphere { center, radius } = Sphere::bounding(&mesh.vertices);

@@ -191,7 +191,7 @@ impl Sensor {
         in_view && (self.range_m[0]..=self.range_m[1]).contains(&range)
     }
 
-    /// Pose T_world_sensor of the sensor at `eye` turned toward `forward`, upright about the world's z axis.
+    /// Pose `T_world_sensor` of the sensor at `eye` turned toward `forward`, upright about the world's z axis.
     ///
     /// A lidar stays level and only turns toward `forward`.
     pub(super) fn pose(&self, eye: Vector3<f64>, forward: Vector3<f64>) -> Rigid {
@@ -203,9 +203,7 @@ impl Sensor {
                 let forward = forward.normalize();
                 Matrix3::from_columns(&[right, forward.cross(&right), forward])
             }
-            Optics::Lidar(_) => {
-                Matrix3::from_columns(&[Vector3::z().cross(&right), -right, Vector3::z()])
-            }
+            Optics::Lidar(_) => Matrix3::from_columns(&[Vector3::z().cross(&right), -right, Vector3::z()]),
         };
         Rigid { rotation, translation: eye }
     }

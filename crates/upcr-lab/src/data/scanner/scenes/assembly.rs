@@ -28,13 +28,7 @@ const WAVES: usize = 6;
 impl Bumps {
     /// `amplitude` is the standard deviation of the first octave, whose wavelength is `wavelength`; each
     /// following one has half of that and `roughness` times the amplitude.
-    pub fn new(
-        rng: &mut impl Rng,
-        octaves: i32,
-        wavelength: f64,
-        amplitude: f64,
-        roughness: f64,
-    ) -> Self {
+    pub fn new(rng: &mut impl Rng, octaves: i32, wavelength: f64, amplitude: f64, roughness: f64) -> Self {
         let mut wave = |octave: i32| {
             let frequency = TAU / wavelength * 2.0_f64.powi(octave) * rng.random_range(0.7..1.3);
             let amplitude = amplitude * roughness.powi(octave) * (2.0 / WAVES as f64).sqrt();

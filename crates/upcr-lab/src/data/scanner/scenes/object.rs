@@ -31,7 +31,8 @@ pub fn object(seed: u64) -> TriangleMesh {
         ([0.34, 0.20, 0.32], [0.22, 0.12, 0.13], [0.0, -0.2, 0.4], 0.06, 64),
     ];
     for (center, radii, tilt, depth, steps) in parts {
-        let mut vary = |v: [f64; 3], by: f64| Vector3::from(v.map(|c| c * rng.random_range(1.0 - by..1.0 + by)));
+        let mut vary =
+            |v: [f64; 3], by: f64| Vector3::from(v.map(|c| c * rng.random_range(1.0 - by..1.0 + by)));
         let (center, radii) = (vary(center, 0.04), vary(radii, 0.15));
         let tilt = vary(tilt, 0.4);
         let bumps = Bumps::new(&mut rng, 4, 1.6, depth, 0.5);
@@ -41,10 +42,12 @@ pub fn object(seed: u64) -> TriangleMesh {
     }
 
     let mesh = &mut statue.mesh;
-    let (low, high) = mesh.vertices.iter().fold(
-        (Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::NEG_INFINITY)),
-        |(low, high), &v| (low.inf(&v.into()), high.sup(&v.into())),
-    );
+    let (low, high) = mesh
+        .vertices
+        .iter()
+        .fold((Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::NEG_INFINITY)), |(low, high), &v| {
+            (low.inf(&v.into()), high.sup(&v.into()))
+        });
     let middle = (low + high) / 2.0;
     let radius = mesh.vertices.iter().map(|&v| (Vector3::from(v) - middle).norm()).fold(0.0, f64::max);
     for vertex in &mut mesh.vertices {

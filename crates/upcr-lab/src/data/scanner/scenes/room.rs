@@ -134,7 +134,8 @@ fn shelf(rng: &mut impl Rng) -> Assembly {
             if x + thickness > width / 2.0 - 0.03 {
                 break;
             }
-            let size = V::new(thickness, rng.random_range(0.5..0.9) * depth, rng.random_range(0.4..0.85) * pitch);
+            let size =
+                V::new(thickness, rng.random_range(0.5..0.9) * depth, rng.random_range(0.4..0.85) * pitch);
             if rng.random_bool(0.75) {
                 shelf.cuboid(V::new(x + thickness / 2.0, 0.0, z + 0.03), size, 0.0);
             }
@@ -188,7 +189,8 @@ fn knick_knack(scene: &mut Assembly, base: V, rng: &mut impl Rng) {
     let size = rng.random_range(0.07..0.13);
     match rng.random_range(0..3) {
         0 => {
-            let profile = [(0.0, 0.0), (0.6, 0.0), (1.0, 0.7), (0.9, 1.3), (0.4, 1.9), (0.55, 2.3), (0.0, 2.2)];
+            let profile =
+                [(0.0, 0.0), (0.6, 0.0), (1.0, 0.7), (0.9, 1.3), (0.4, 1.9), (0.55, 2.3), (0.0, 2.2)];
             scene.revolve(base, &profile.map(|(r, z)| (r * size, z * size)), 32);
         }
         1 => {
@@ -214,7 +216,8 @@ fn plant(scene: &mut Assembly, base: V, rng: &mut impl Rng) {
         let tilt = standing(base + V::z() * 0.33, rng.random_range(-PI..PI));
         let mut leaf = Assembly::default();
         leaf.blob(V::zeros(), V::new(0.05, 0.1, rng.random_range(0.25..0.45)), None, 24);
-        let lean = nalgebra::Rotation3::from_axis_angle(&V::y_axis(), rng.random_range(0.2..0.6)).into_inner();
+        let lean =
+            nalgebra::Rotation3::from_axis_angle(&V::y_axis(), rng.random_range(0.2..0.6)).into_inner();
         let placed = tilt * Rigid { rotation: lean, translation: lean * V::z() * 0.3 };
         scene.append(&leaf, &placed);
     }
