@@ -68,7 +68,7 @@ mod tests {
         Sensor { optics, range_m: [0.0, 100.0], noise }
     }
 
-    fn scan_of(assembly: Assembly, sensor: &Sensor) -> Vec<[f64; 3]> {
+    fn scan_of(assembly: &Assembly, sensor: &Sensor) -> Vec<[f64; 3]> {
         scan(&Bvh::new(&assembly.mesh).unwrap(), sensor, &Rigid::identity(), 7)
     }
 
@@ -76,7 +76,7 @@ mod tests {
     fn a_wall_is_measured_within_the_noise() {
         let noise = RangeNoise { constant_m: 0.002, quadratic_per_m: 0.001, ..RangeNoise::NONE };
         let sensor = camera(noise);
-        let points = scan_of(wall_at(3.0, 50.0), &sensor);
+        let points = scan_of(&wall_at(3.0, 50.0), &sensor);
         assert_eq!(points.len(), 160 * 120);
         let normalized: Vec<f64> = points
             .iter()
@@ -96,7 +96,7 @@ mod tests {
         sphere.blob(Vector3::zeros(), Vector3::repeat(2.0), None, 256);
         let optics = Optics::Lidar(Lidar { beams: 32, azimuth_steps: 200, elevation_deg: [-60.0, 60.0] });
         let sensor = Sensor { optics, range_m: [0.1, 10.0], noise: RangeNoise::NONE };
-        let points = scan_of(sphere, &sensor);
+        let points = scan_of(&sphere, &sensor);
         assert_eq!(points.len(), 32 * 200);
         assert!(points.iter().all(|p| (Vector3::from(*p).norm() - 2.0).abs() < 1e-3));
         assert!(points.iter().all(|p| sensor.covers(&(Vector3::from(*p) * (1.0 - 1e-9)))));
@@ -106,7 +106,7 @@ mod tests {
     fn the_near_wall_hides_the_far_one() {
         let mut scene = wall_at(4.0, 50.0);
         scene.append(&wall_at(2.0, 0.5), &Rigid::identity());
-        let points = scan_of(scene, &camera(RangeNoise::NONE));
+        let points = scan_of(&scene, &camera(RangeNoise::NONE));
         let shadow = |p: &&[f64; 3]| (p[2] - 4.0).abs() < 1e-9 && p[0].abs() < 0.99 && p[1].abs() < 0.99;
         assert_eq!(points.iter().filter(shadow).count(), 0);
         assert!(points.iter().any(|p| (p[2] - 2.0).abs() < 1e-9));
@@ -116,11 +116,11 @@ mod tests {
     #[test]
     fn dropouts_come_at_their_rate() {
         let noise = RangeNoise { dropout: 0.2, ..RangeNoise::NONE };
-        let kept = scan_of(wall_at(3.0, 50.0), &camera(noise)).len() as f64 / (160.0 * 120.0);
+        let kept = scan_of(&wall_at(3.0, 50.0), &camera(noise)).len() as f64 / (160.0 * 120.0);
         assert!((kept - 0.8).abs() < 0.01, "{kept}");
 
         let noise = RangeNoise { grazing_deg: 30.0, ..RangeNoise::NONE };
-        let points = scan_of(wall_at(3.0, 50.0), &camera(noise));
+        let points = scan_of(&wall_at(3.0, 50.0), &camera(noise));
         let incidence_deg = |p: &[f64; 3]| (p[2] / Vector3::from(*p).norm()).acos().to_degrees();
         let sensor = camera(noise);
         let rays = || (0..120).flat_map(|r| (0..160).map(move |c| sensor.ray(r, c).into()));
@@ -133,7 +133,7 @@ mod tests {
     fn ranges_are_quantised_and_cut() {
         let noise = RangeNoise { quantum_m: 0.01, ..RangeNoise::NONE };
         let sensor = Sensor { range_m: [3.2, 3.5], ..camera(noise) };
-        for point in scan_of(wall_at(3.0, 50.0), &sensor) {
+        for point in scan_of(&wall_at(3.0, 50.0), &sensor) {
             let range = Vector3::from(point).norm();
             assert!((range / 0.01 - (range / 0.01).round()).abs() < 1e-6);
             assert!((3.19..3.51).contains(&range));

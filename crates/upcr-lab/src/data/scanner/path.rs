@@ -39,7 +39,7 @@ pub(super) enum Course {
 }
 
 impl Path {
-    /// Pose T_world_sensor at the angle `s` in rad along the path.
+    /// Pose `T_world_sensor` at the angle `s` in rad along the path.
     fn pose(&self, s: f64, sensor: &Sensor, scene: &Bvh) -> Rigid {
         let (sin, cos) = (s + self.phase).sin_cos();
         let [a, b] = self.half_axes;
@@ -54,7 +54,7 @@ impl Path {
                 sensor.pose(self.center + radial, -radial)
             }
             Course::Across => {
-                sensor.pose(eye, (ahead * 0.3 - aside).normalize() - Vector3::z() * (0.25 + 0.1 * swing))
+                sensor.pose(eye, (ahead * 0.3 - aside).normalize() - Vector3::z() * (0.45 + 0.1 * swing))
             }
             Course::Along => sensor.pose(eye, ahead),
             Course::OverGround(height) => {
@@ -66,7 +66,7 @@ impl Path {
         }
     }
 
-    /// Poses T_world_sensor of `count` scans, neighbours overlapping by `wanted` as nearly as the path allows.
+    /// Poses `T_world_sensor` of `count` scans, neighbours overlapping by `wanted` as nearly as the path allows.
     pub(super) fn poses(&self, count: usize, wanted: f64, sensor: &Sensor, scene: &Bvh) -> Vec<Rigid> {
         let mut s = 0.0;
         let mut poses = vec![self.pose(s, sensor, scene)];

@@ -191,7 +191,7 @@ impl Sensor {
         in_view && (self.range_m[0]..=self.range_m[1]).contains(&range)
     }
 
-    /// Pose T_world_sensor of the sensor at `eye` turned toward `forward`, upright about the world's z axis.
+    /// Pose `T_world_sensor` of the sensor at `eye` turned toward `forward`, upright about the world's z axis.
     ///
     /// A lidar stays level and only turns toward `forward`.
     pub(super) fn pose(&self, eye: Vector3<f64>, forward: Vector3<f64>) -> Rigid {

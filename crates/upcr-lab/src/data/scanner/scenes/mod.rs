@@ -21,9 +21,11 @@ mod tests {
     use super::*;
     use nalgebra::Vector3;
 
+    type Build = fn(u64) -> upcr::TriangleMesh;
+
     #[test]
     fn scenes_have_their_sizes_and_follow_their_seeds() {
-        let scenes: [(fn(u64) -> upcr::TriangleMesh, [f64; 3], [f64; 3]); 4] = [
+        let scenes: [(Build, [f64; 3], [f64; 3]); 4] = [
             (object, [0.08; 3], [0.2; 3]),
             (room, [5.0, 4.0, 2.7], [5.6, 4.6, 2.9]),
             (street, [100.0, 15.0, 8.0], [110.0, 60.0, 25.0]),

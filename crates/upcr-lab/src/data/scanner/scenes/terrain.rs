@@ -17,12 +17,12 @@ const ROCKS: usize = 40;
 /// Hilly ground of 50 × 50 m with rocks on it, without a plane or a symmetry.
 pub fn terrain(seed: u64) -> TriangleMesh {
     let mut rng = random::stream(seed, 0);
-    let hills = Bumps::new(&mut rng, 6, 30.0, 1.3, 0.45);
+    let hills = Bumps::new(&mut rng, 6, 30.0, 0.8, 0.45);
     let ridges = Bumps::new(&mut rng, 2, 18.0, 1.0, 0.5);
     // Where |noise| has its crease, the ground has a gully.
     let ground = |x: f64, y: f64| {
         let at = Vector3::new(x, y, 0.0);
-        Vector3::new(x, y, hills.at(&at) + 0.8 * ridges.at(&at).abs())
+        Vector3::new(x, y, hills.at(&at) + 0.5 * ridges.at(&at).abs())
     };
     let mut terrain = Assembly::default();
     terrain.surface([CELLS, CELLS], |u, v| ground((u - 0.5) * TERRAIN_SIZE_M, (v - 0.5) * TERRAIN_SIZE_M));
