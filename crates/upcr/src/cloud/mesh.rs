@@ -50,6 +50,7 @@ impl TriangleMesh {
 }
 
 #[cfg(test)]
+#[allow(clippy::float_cmp)]
 mod tests {
     use super::*;
 

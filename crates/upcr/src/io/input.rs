@@ -189,13 +189,7 @@ impl Words {
     /// The next word as a number.
     pub(super) fn number(&mut self, input: &mut Input) -> Fallible<f64> {
         let word = self.next(input)?;
-        match word.parse() {
-            Ok(value) => Ok(value),
-            Err(_) => {
-                let reason = format!("`{word}` is not a number");
-                input.bad_line(reason)
-            }
-        }
+        word.parse().or_else(|_| input.bad_line(format!("`{word}` is not a number")))
     }
 }
 

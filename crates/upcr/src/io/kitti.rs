@@ -19,7 +19,7 @@ const STRIDE: u64 = 16;
 /// The scanner is at the origin, but the format does not say so, and other programs write moved clouds too:
 /// no viewpoint is set.
 fn read(input: &mut Input, _: &ReadOptions) -> Fallible<PointCloud> {
-    if input.len % STRIDE != 0 {
+    if !input.len.is_multiple_of(STRIDE) {
         return malformed(format!("its {} bytes are not a multiple of {STRIDE}", input.len));
     }
     let count = input.len / STRIDE;

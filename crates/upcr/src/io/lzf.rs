@@ -1,4 +1,4 @@
-//! LZF, the compression inside binary_compressed PCD files.
+//! LZF, the compression inside `binary_compressed` PCD files.
 //!
 //! A control byte below 32 announces that many literal bytes and one more. Any other is a reference back: its
 //! upper three bits are the length less 2 (7: the next byte adds to it), its lower five and one more byte the

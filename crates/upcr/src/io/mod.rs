@@ -40,8 +40,10 @@ struct Format {
     /// In lower case.
     extensions: &'static [&'static str],
     read: Reader,
-    write: Option<fn(&mut Output, &PointCloud, &WriteOptions) -> Fallible<()>>,
+    write: Option<Writer>,
 }
+
+type Writer = fn(&mut Output, &PointCloud, &WriteOptions) -> Fallible<()>;
 
 /// What a format's files hold.
 #[derive(Clone, Copy)]

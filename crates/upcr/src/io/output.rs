@@ -46,7 +46,7 @@ fn create_beside(path: &Path) -> io::Result<(Temporary, File)> {
         .to_string_lossy();
     loop {
         let serial = COUNTER.fetch_add(1, Ordering::Relaxed);
-        let candidate = path.with_file_name(format!(".{name}.{}-{serial}.tmp", std::process::id()));
+        let candidate = path.with_file_name(format!(".{name}.{serial}.tmp"));
         match File::options().read(true).write(true).create_new(true).open(&candidate) {
             Ok(file) => return Ok((Temporary { path: candidate, kept: false }, file)),
             Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}

@@ -1,4 +1,4 @@
-//! PCD 0.7: ascii, binary and binary_compressed.
+//! PCD 0.7: `ascii`, `binary` and `binary_compressed`.
 
 use std::io::Write;
 
@@ -44,10 +44,8 @@ fn read(input: &mut Input, _: &ReadOptions) -> Fallible<PointCloud> {
         return malformed("there are no fields x, y and z");
     };
     let Header { points, stride, .. } = header;
-    if header.data != "ascii" {
-        if let Some(Color::Packed { float, .. }) = &mut columns.color {
-            *float = false;
-        }
+    if let Some(Color::Packed { float, .. }) = &mut columns.color {
+        *float &= header.data == "ascii";
     }
     // A packed colour is taken bit by bit: as a float it may be a NaN, whose bits conversion changes.
     let scalar = |c: usize| match columns.color {
@@ -261,6 +259,7 @@ fn write(out: &mut Output, cloud: &PointCloud, options: &WriteOptions) -> Fallib
     Ok(())
 }
 
+#[derive(Clone, Copy)]
 enum Value {
     Double(f64),
     Single(f32),

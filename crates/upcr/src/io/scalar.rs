@@ -89,5 +89,5 @@ impl Scalar {
 
 /// Whether every coordinate is an `f32`, so that four bytes hold it.
 pub(super) fn fits_f32(points: &[[f64; 3]]) -> bool {
-    points.iter().flatten().all(|&v| f64::from(v as f32) == v || v.is_nan())
+    points.iter().flatten().all(|&v| f64::from(v as f32).to_bits() == v.to_bits() || v.is_nan())
 }

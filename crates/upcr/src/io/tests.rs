@@ -1,5 +1,7 @@
 //! What every format has to keep, and what every reader has to refuse.
 
+#![allow(clippy::float_cmp)]
+
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
@@ -65,10 +67,8 @@ fn written(extension: &str, cloud: &PointCloud, encoding: Encoding) -> Vec<u8> {
 #[track_caller]
 fn assert_malformed<T: std::fmt::Debug>(result: Fallible<T>, word: &str) {
     match result {
-        Err(Fault::Malformed(reason)) => {
-            assert!(reason.contains(word), "`{reason}` does not speak of `{word}`")
-        }
-        other => panic!("not called malformed: {other:?}"),
+        Err(Fault::Malformed(reason)) if reason.contains(word) => {}
+        other => panic!("not malformed because of `{word}`: {other:?}"),
     }
 }
 
@@ -443,7 +443,7 @@ fn depth_images_become_points_before_the_camera() {
     assert!(matches!(cloud_from("png", &file), Err(Fault::Unsupported(_))), "no camera for 2×2");
     let grey = depth_png(2, 2, png::BitDepth::Eight, &pixels[..4]);
     assert!(matches!(cloud_from("png", &grey), Err(Fault::Unsupported(_))));
-    let kinect = depth_png(640, 480, png::BitDepth::Sixteen, &[3; 640 * 480 * 2]);
+    let kinect = depth_png(640, 480, png::BitDepth::Sixteen, &vec![3; 640 * 480 * 2]);
     assert_eq!(cloud_from("png", &kinect).unwrap().len(), 640 * 480);
     assert_malformed(cloud_from("png", &kinect[..100]), "");
     // The same header, but of 2^31 - 1 by 480 pixels.
@@ -484,14 +484,11 @@ fn las_claims_are_checked() {
 #[test]
 fn damaged_laz_is_an_error_or_a_cloud() {
     let file = written("laz", &rich_cloud(300), Encoding::Binary);
-    std::panic::set_hook(Box::new(|_| {}));
-    let whole = (100..file.len()).all(|at| {
+    for at in (100..file.len()).step_by(5) {
         let mut damaged = file.clone();
         damaged[at] ^= 0xff;
-        std::panic::catch_unwind(|| cloud_from("laz", &damaged).is_ok()).is_ok()
-    });
-    let _ = std::panic::take_hook();
-    assert!(whole);
+        let _ = cloud_from("laz", &damaged);
+    }
 }
 
 #[test]

@@ -117,3 +117,43 @@ fn for_each_batch(
     }
     if batch.is_empty() { Ok(()) } else { write(&batch) }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::io::{ReadOptions, output::write_atomically};
+
+    /// A cloud written in point format 7, whose compression is in layers.
+    fn layered() -> (PointCloud, Vec<u8>) {
+        let points = (0..500).map(|i| [f64::from(i) * 0.5, f64::from(i % 13), -f64::from(i % 7)]).collect();
+        let colors = (0..500u16).map(|i| [i as u8, 255 - (i as u8), 7]).collect();
+        let cloud = PointCloud { colors: Some(colors), ..PointCloud::from_points(points) };
+        let base = Header::for_cloud(&cloud).unwrap();
+        let header =
+            Header { compressed: true, point_format: 7, record_length: 36, color_at: Some(30), ..base };
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cloud.laz");
+        write_atomically(&path, |out| laz::write(out, &header, &cloud)).unwrap();
+        (cloud, std::fs::read(path).unwrap())
+    }
+
+    fn read_bytes(bytes: &[u8]) -> Fallible<PointCloud> {
+        read(&mut Input::new(std::io::Cursor::new(bytes.to_vec()))?, &ReadOptions::default())
+    }
+
+    #[test]
+    fn layered_compression_comes_back() {
+        let (cloud, file) = layered();
+        assert_eq!(read_bytes(&file).unwrap(), cloud);
+    }
+
+    #[test]
+    fn damaged_layers_are_an_error_or_a_cloud() {
+        let (_, file) = layered();
+        for at in (100..file.len()).step_by(19) {
+            let mut damaged = file.clone();
+            damaged[at] ^= 0xff;
+            let _ = read_bytes(&damaged);
+        }
+    }
+}
