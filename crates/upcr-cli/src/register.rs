@@ -7,11 +7,10 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::ValueEnum;
-use upcr::{Locks, Method, Refinement, Registration, Settings};
+use upcr::{Locks, Method, Refinement, Registration, Settings, io};
 
 use crate::output::{self, Progress};
 use crate::{NOT_REGISTERED, input};
-use upcr::io;
 
 /// Find the pose that lays SOURCE on TARGET
 #[derive(clap::Args)]
