@@ -47,7 +47,7 @@ class Run:
 
 def call(command: list[str], threads: int, timeout: float) -> tuple[int, dict | None, str, float]:
     """Exit status, the JSON printed, why there is none, and the wall time in ms. Never raises."""
-    environment = os.environ | {"RAYON_NUM_THREADS": str(threads)}
+    environment = os.environ | {"RAYON_NUM_THREADS": str(threads), "RUST_BACKTRACE": "0"}
     start = time.perf_counter()
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", timeout=timeout)
