@@ -18,18 +18,23 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 /// `register` ran, but found no pose to trust.
 const NOT_REGISTERED: u8 = 3;
 
-const AFTER_HELP: &str = "\
+fn after_help() -> String {
+    format!(
+        "\
 Exit status:
   0  done
   1  error: a file, a cloud or a setting is not usable; the reason is on stderr
   2  the command line is not understood
-  3  `register` found no trustworthy pose (probability below 0.5)
+  3  `register` found no trustworthy pose (probability below {})
 
-The answer alone goes to stdout; errors and progress go to stderr.";
+The answer alone goes to stdout; errors and progress go to stderr.",
+        upcr::TRUSTWORTHY
+    )
+}
 
 /// Rigid registration of point clouds
 #[derive(Parser)]
-#[command(version, after_help = AFTER_HELP)]
+#[command(name = "upcr", version, after_help = after_help())]
 struct Cli {
     #[command(subcommand)]
     command: Command,

@@ -2,12 +2,12 @@
 
 use std::fmt::Write;
 use std::num::NonZeroUsize;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::ValueEnum;
-use upcr::{Locks, Method, Refinement, Registration, Settings, io};
+use upcr::{Locks, Method, Refinement, Registration, RobustKernel, Settings, io};
 
 use crate::output::{self, Progress};
 use crate::{NOT_REGISTERED, input};
@@ -31,6 +31,12 @@ pub struct Args {
     /// A first guess of the pose: a text file with a 4x4 row-major matrix, source to target
     #[arg(long, value_name = "FILE")]
     init: Option<PathBuf>,
+    /// How residuals of the refinement are weighed
+    #[arg(long, value_enum, default_value_t = Settings::default().kernel)]
+    kernel: RobustKernel,
+    /// Share of the closest pairs that the refinement keeps, 0 to 1 [default: all within reach]
+    #[arg(long, value_name = "SHARE", allow_negative_numbers = true)]
+    overlap: Option<f64>,
     /// Degrees of freedom that keep their value in the first guess, e.g. `roll,pitch,z`
     #[arg(long, value_name = "AXES", value_enum, value_delimiter = ',')]
     lock: Vec<Axis>,
@@ -82,10 +88,11 @@ impl Args {
             refine: self.refine,
             voxel_size: self.voxel_size,
             init: self.init.as_deref().map(io::read_transform).transpose()?,
+            kernel: self.kernel,
+            overlap: self.overlap,
             locks,
             seed: self.seed,
             threads: self.threads,
-            ..Settings::default()
         })
     }
 }
@@ -115,14 +122,14 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if args.json {
         output::answer_json(&found)?;
     } else {
-        output::answer(&summary(&found, &args.source, &args.target))?;
+        output::answer(&summary(&found, args))?;
     }
     Ok(if trusted { ExitCode::SUCCESS } else { ExitCode::from(NOT_REGISTERED) })
 }
 
-fn summary(found: &Registration, source: &Path, target: &Path) -> String {
+fn summary(found: &Registration, args: &Args) -> String {
     let pose = &found.T_target_source;
-    let mut text = format!("{} -> {}\n\nT_target_source\n", source.display(), target.display());
+    let mut text = format!("{} -> {}\n\nT_target_source\n", args.source.display(), args.target.display());
     for [a, b, c, t] in pose.to_rows() {
         let _ = writeln!(text, "  {a:>10.6} {b:>10.6} {c:>10.6} {t:>15.6}");
     }
@@ -157,7 +164,7 @@ fn summary(found: &Registration, source: &Path, target: &Path) -> String {
         if found.converged { "converged" } else { "not converged" },
         found.iterations
     );
-    let from = if found.settings.voxel_size.is_some() { "given" } else { "derived from the clouds" };
+    let from = if args.voxel_size.is_some() { "given" } else { "derived from the clouds" };
     let _ = writeln!(text, "voxel size   {:.6} ({from})", found.voxel_size);
     let ms = &found.timings_ms;
     let _ = writeln!(

@@ -180,7 +180,11 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Res
     if voxel_size < smallest_voxel_size(bounds.diagonal()) {
         return Err(Error::InvalidSetting {
             name: "voxel_size",
-            reason: format!("{voxel_size} is too small for the {}'s extent of {}", checked.role, bounds.diagonal()),
+            reason: format!(
+                "{voxel_size} is too small for the {}'s extent of {}",
+                checked.role,
+                bounds.diagonal()
+            ),
         });
     }
     let origin = bounds.center();

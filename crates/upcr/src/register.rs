@@ -261,6 +261,12 @@ fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<
         }
         None => derive_voxel_size(&source, &target),
     };
+    if let Some(share) = settings.overlap
+        && !(share > 0.0 && share <= 1.0)
+    {
+        let reason = format!("must lie between 0 (excluded) and 1, not {share}");
+        return Err(Error::InvalidSetting { name: "overlap", reason });
+    }
     let features = settings.method != Method::Prior;
     let (source, target) =
         rayon::join(|| prepare(&source, voxel_size, features), || prepare(&target, voxel_size, features));
@@ -362,9 +368,8 @@ impl<'a> Pipeline<'a> {
     /// Ranks hypotheses by overlap, refines the best coarsely, ranks again, refines the best of those finely.
     fn refine_hypotheses(&mut self, hypotheses: &[Hypothesis]) {
         let (source, target) = (self.source.coarse(), self.target.coarse());
-        let all = |level: &Level, count| {
-            Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), count)
-        };
+        let all =
+            |level: &Level, count| Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), count);
         let limit = 2.0 * source.voxel_size.max(target.voxel_size);
         let rank = |pose: &Rigid, points: usize| {
             let forward = distances(source, &all(source, points), target, pose, limit);
@@ -377,12 +382,8 @@ impl<'a> Pipeline<'a> {
         ranked.truncate(COARSE_CANDIDATES);
 
         let moved = all(source, COARSE_POINTS);
-        let schedule = Schedule {
-            max_distance: (2.0 * limit, limit),
-            shrink_over: 4,
-            max_iterations: 8,
-            keep: 1.0,
-        };
+        let schedule =
+            Schedule { max_distance: (2.0 * limit, limit), shrink_over: 4, max_iterations: 8, keep: 1.0 };
         let factor = factor(self.settings.refine);
         let lock = self.lock.as_ref();
         if self.settings.refine != Refinement::None {
@@ -427,9 +428,8 @@ impl<'a> Pipeline<'a> {
         let factor = factor(self.settings.refine);
         let kernel = self.settings.kernel;
         let refined = refine(source, &moved, target, &hypothesis.pose, factor, kernel, &schedule, lock);
-        let all = |level: &Level| {
-            Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), SCORING_POINTS)
-        };
+        let all =
+            |level: &Level| Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), SCORING_POINTS);
         let limit = 2.0 * voxel;
         let forward = distances(source, &all(source), target, &refined.pose, limit);
         let backward = distances(target, &all(target), source, &refined.pose.inverse(), limit);

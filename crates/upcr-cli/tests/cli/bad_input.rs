@@ -112,6 +112,9 @@ fn settings_out_of_range() {
     for size in ["0", "-1", "nan", "inf", "1e-300"] {
         upcr(["register", &source, &target, "--voxel-size", size]).assert_fails(1, &["voxel_size"]);
     }
+    for share in ["0", "-0.5", "1.5", "nan"] {
+        upcr(["register", &source, &target, "--overlap", share]).assert_fails(1, &["overlap"]);
+    }
 }
 
 #[test]
@@ -121,7 +124,7 @@ fn a_first_guess_that_is_no_pose() {
     for (name, text) in [
         ("empty.txt", ""),
         ("words.txt", "one two three"),
-        ("short.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n"),
+        ("short.txt", "1 0 0 0\n0 1 0 0\n"),
         ("long.txt", &"1 0 0 0 0\n".repeat(4)),
         ("scale.txt", "2 0 0 0\n0 2 0 0\n0 0 2 0\n0 0 0 1\n"),
         ("mirror.txt", "-1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
@@ -142,14 +145,16 @@ fn a_command_line_that_is_not_understood() {
     {
         upcr(["register", &source, &target, &format!("--lock={lock}")]).assert_fails(2, &["--lock"]);
     }
-    for wrong in [
-        ["--method", "magic"],
-        ["--refine", "icp"],
-        ["--seed", "-1"],
-        ["--threads", "0"],
-        ["--voxel-size", "x"],
+    for (option, value) in [
+        ("--method", "magic"),
+        ("--refine", "icp"),
+        ("--kernel", "square"),
+        ("--seed", "-1"),
+        ("--threads", "0"),
+        ("--voxel-size", "x"),
+        ("--overlap", "half"),
     ] {
-        upcr(["register", &source, &target, wrong[0], wrong[1]]).assert_fails(2, &[wrong[0]]);
+        upcr(["register", &source, &target, &format!("{option}={value}")]).assert_fails(2, &[option]);
     }
     upcr(["register", &source]).assert_fails(2, &["TARGET"]);
     upcr(["registre"]).assert_fails(2, &["registre"]);

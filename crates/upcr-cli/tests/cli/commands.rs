@@ -1,6 +1,6 @@
 //! The commands beside `register`.
 
-use crate::{Scratch, sample, surface, upcr};
+use crate::{Scratch, numbers, pose_error, sample, surface, upcr};
 
 #[test]
 fn info_says_what_a_file_holds() {
@@ -98,11 +98,15 @@ fn synth_writes_scans_that_register_to_their_poses() {
     let scratch = Scratch::new();
     let (once, twice) = (scratch.path("once"), scratch.path("twice"));
     for out in [&once, &twice] {
-        let run = upcr(["synth", "--scans", "2", "--seed", "3", "--out", out]);
+        let run = upcr(["synth", "--scene", "object", "--seed", "3", "--out", out]);
         assert_eq!(run.status, 0, "{}", run.stderr);
-        for file in run.stdout.lines() {
-            assert!(std::path::Path::new(file).is_file(), "{file}");
+        assert_eq!(run.stdout.lines().count(), 2, "{}", run.stdout);
+        for name in ["scan_000.ply", "scan_001.ply"] {
+            assert!(
+                upcr(["info", &format!("{out}/{name}"), "--json"]).json()["points"].as_u64() > Some(1000)
+            );
         }
+        assert_eq!(numbers(format!("{out}/T_world_001.txt")).len(), 16);
     }
     // The same seed, the same bytes.
     for entry in std::fs::read_dir(&once).unwrap() {
@@ -110,6 +114,26 @@ fn synth_writes_scans_that_register_to_their_poses() {
         let twin = std::path::Path::new(&twice).join(path.file_name().unwrap());
         assert_eq!(std::fs::read(&path).unwrap(), std::fs::read(twin).unwrap(), "{}", path.display());
     }
+    // From the true pose, the registration stays there.
+    let [source, target, truth] =
+        ["scan_001.ply", "scan_000.ply", "T_000_001.txt"].map(|n| format!("{once}/{n}"));
+    let found = scratch.path("T.txt");
+    let run = upcr([
+        "register",
+        &source,
+        &target,
+        "--method",
+        "prior",
+        "--init",
+        &truth,
+        "--transform",
+        &found,
+        "--json",
+    ]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let (degrees, offset) = pose_error(&numbers(&found), &numbers(&truth));
+    let voxel = run.json()["voxel_size"].as_f64().unwrap();
+    assert!(degrees < 1.0 && offset < 2.0 * voxel, "off by {degrees}° and {offset}");
 }
 
 #[test]

@@ -99,6 +99,13 @@ fn numbers(path: impl AsRef<Path>) -> Vec<f64> {
     text.split_whitespace().map(|word| word.parse().unwrap()).collect()
 }
 
+/// Rotation error in degrees and translation error of the row-major 4x4 `found` against `truth`.
+fn pose_error(found: &[f64], truth: &[f64]) -> (f64, f64) {
+    let trace: f64 = (0..3).flat_map(|r| (0..3).map(move |c| 4 * r + c)).map(|i| found[i] * truth[i]).sum();
+    let offset: f64 = [3, 7, 11].iter().map(|&i| (found[i] - truth[i]).powi(2)).sum();
+    (((trace - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees(), offset.sqrt())
+}
+
 /// A curved surface, without symmetry, of `n * n` points over `size` by `size`.
 fn surface(n: usize, size: f64) -> Vec<[f64; 3]> {
     let at = |i: usize| i as f64 / (n - 1) as f64;

@@ -197,9 +197,10 @@ impl PointCloud {
                 .map(|m| std::array::from_fn(|k| m.point[k] / m.count + bounds.min[k]))
                 .collect(),
             normals: self.normals.as_ref().map(|_| means.iter().map(|m| unit(m.normal)).collect()),
-            colors: self.colors.as_ref().map(|_| {
-                means.iter().map(|m| m.color.map(|c| (c / m.count as f32).round() as u8)).collect()
-            }),
+            colors: self
+                .colors
+                .as_ref()
+                .map(|_| means.iter().map(|m| m.color.map(|c| (c / m.count as f32).round() as u8)).collect()),
             viewpoint: self.viewpoint,
         })
     }

@@ -61,11 +61,8 @@ fn graduate(mut pose: Rigid, pairs: &[Correspondence], diagonal: f32, tolerance:
     let mut mu = f64::from(diagonal).powi(2).max(floor);
     let mut damping = 0.0;
     loop {
-        let objective = Objective {
-            factor: factor(Refinement::Point),
-            kernel: RobustKernel::GemanMcclure,
-            scale_sq: mu,
-        };
+        let objective =
+            Objective { factor: factor(Refinement::Point), kernel: RobustKernel::GemanMcclure, scale_sq: mu };
         for _ in 0..STEPS_PER_SCALE {
             match objective.step(&pose, pairs, None, &mut damping) {
                 Some(next) => pose = next,
@@ -89,10 +86,8 @@ fn tuples(matches: &[Match], seed: u64) -> Vec<Match> {
     for _ in 0..TUPLE_TRIALS_PER_MATCH * matches.len() {
         let triple: [&Match; 3] = std::array::from_fn(|_| &matches[rng.random_range(0..matches.len())]);
         let congruent = [(0, 1), (1, 2), (2, 0)].iter().all(|&(a, b)| {
-            let (ds, dt) = (
-                distance(triple[a].source, triple[b].source),
-                distance(triple[a].target, triple[b].target),
-            );
+            let (ds, dt) =
+                (distance(triple[a].source, triple[b].source), distance(triple[a].target, triple[b].target));
             ds > 0.0 && ds.min(dt) > EDGE_RATIO * ds.max(dt)
         });
         if congruent {

@@ -31,10 +31,7 @@ impl Match {
 }
 
 /// The match of every source point.
-pub(crate) fn match_levels(
-    source: (&Level, &Descriptors),
-    target: (&Level, &Descriptors),
-) -> Vec<Match> {
+pub(crate) fn match_levels(source: (&Level, &Descriptors), target: (&Level, &Descriptors)) -> Vec<Match> {
     match_features(source.1, target.1)
         .into_iter()
         .map(|(i, j, ratio, mutual)| Match {
@@ -89,8 +86,7 @@ fn match_features(source: &Descriptors, target: &Descriptors) -> Vec<(u32, u32, 
 /// For every row of `queries` its nearest of `rows`, by blocks of one matrix product each.
 fn nearest_rows(queries: &Descriptors, rows: &Descriptors) -> Vec<Best> {
     let dim = rows.dim;
-    let norms: Vec<f32> =
-        (0..rows.len()).map(|j| rows.row(j).iter().map(|v| v * v).sum::<f32>()).collect();
+    let norms: Vec<f32> = (0..rows.len()).map(|j| rows.row(j).iter().map(|v| v * v).sum::<f32>()).collect();
     let blocks: Vec<Vec<Best>> = (0..queries.len().div_ceil(BLOCK))
         .into_par_iter()
         .map_init(

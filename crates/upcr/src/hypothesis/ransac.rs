@@ -44,9 +44,8 @@ impl HypothesisSource for Ransac {
                 .map(|stream| {
                     let mut rng = ChaCha8Rng::seed_from_u64(problem.seed);
                     rng.set_stream((trials / STREAM + stream) as u64);
-                    let mut found: Vec<Hypothesis> = (0..STREAM)
-                        .filter_map(|_| trial(&matches, problem.tolerance, &mut rng))
-                        .collect();
+                    let mut found: Vec<Hypothesis> =
+                        (0..STREAM).filter_map(|_| trial(&matches, problem.tolerance, &mut rng)).collect();
                     found.sort_by_key(|h| std::cmp::Reverse(h.support));
                     found.truncate(MAX_HYPOTHESES);
                     found
@@ -71,10 +70,8 @@ impl HypothesisSource for Ransac {
 fn trial(matches: &[Match], tolerance: f32, rng: &mut impl Rng) -> Option<Hypothesis> {
     let triple: [&Match; 3] = std::array::from_fn(|_| &matches[rng.random_range(0..matches.len())]);
     for (a, b) in [(0, 1), (1, 2), (2, 0)] {
-        let (ds, dt) = (
-            distance(triple[a].source, triple[b].source),
-            distance(triple[a].target, triple[b].target),
-        );
+        let (ds, dt) =
+            (distance(triple[a].source, triple[b].source), distance(triple[a].target, triple[b].target));
         if ds <= tolerance || ds.min(dt) < EDGE_RATIO * ds.max(dt) {
             return None;
         }
@@ -83,9 +80,8 @@ fn trial(matches: &[Match], tolerance: f32, rng: &mut impl Rng) -> Option<Hypoth
     if !triple.iter().all(|m| m.agrees_with(&pose, tolerance)) {
         return None;
     }
-    let inliers = |pose: &Rigid| -> Vec<&Match> {
-        matches.iter().filter(|m| m.agrees_with(pose, tolerance)).collect()
-    };
+    let inliers =
+        |pose: &Rigid| -> Vec<&Match> { matches.iter().filter(|m| m.agrees_with(pose, tolerance)).collect() };
     let first = inliers(&pose);
     let refit = align(first.iter().map(|m| (m.source, m.target, 1.0)))?;
     let second = inliers(&refit).len();

@@ -11,9 +11,7 @@ const EPSILON: f64 = 1e-3;
 impl Factor for PlaneToPlane {
     fn information(&self, n: [f64; 3], m: [f64; 3]) -> Symmetric3 {
         let flat = 1.0 - EPSILON;
-        let sum = |i: usize, j: usize| {
-            f64::from(u8::from(i == j)) * 2.0 - flat * (n[i] * n[j] + m[i] * m[j])
-        };
+        let sum = |i: usize, j: usize| f64::from(u8::from(i == j)) * 2.0 - flat * (n[i] * n[j] + m[i] * m[j]);
         let (a, b, c, d, e, f) = (sum(0, 0), sum(0, 1), sum(0, 2), sum(1, 1), sum(1, 2), sum(2, 2));
         // Inverse by cofactors; the determinant is at least ε for unit normals.
         let (ca, cb, cc) = (d * f - e * e, c * e - b * f, b * e - c * d);

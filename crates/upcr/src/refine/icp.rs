@@ -69,7 +69,8 @@ pub(crate) fn refine(
             refined.converged = false;
             return refined;
         }
-        let objective = Objective { factor, kernel, scale_sq: scale_sq(factor, &pairs, &refined.pose, max_distance) };
+        let objective =
+            Objective { factor, kernel, scale_sq: scale_sq(factor, &pairs, &refined.pose, max_distance) };
         refined.iterations = iteration + 1;
         let Some(next) = objective.step(&refined.pose, &pairs, lock, &mut damping) else {
             refined.converged = along >= 1.0;
@@ -139,7 +140,9 @@ fn correspondences(
             for &i in block {
                 let p = source.points[i as usize];
                 let y = rotation * Vector3::from(p) + translation;
-                let Some(nearest) = target.tree.nearest(y.into(), max_distance * max_distance) else { continue };
+                let Some(nearest) = target.tree.nearest(y.into(), max_distance * max_distance) else {
+                    continue;
+                };
                 let (m, n) = (source.normals[i as usize], target.normals[nearest.index as usize]);
                 let cosine = f64::from((rotation * Vector3::from(m)).dot(&Vector3::from(n)));
                 if cosine.abs() < NORMAL_COSINE {

@@ -19,12 +19,7 @@ pub(crate) struct LockedPose {
 
 impl LockedPose {
     /// Locks `locks` at the values that `init` (file frames) has; `None` where nothing is locked.
-    pub fn new(
-        locks: Locks,
-        init: &Rigid,
-        source_origin: [f64; 3],
-        target_origin: [f64; 3],
-    ) -> Option<Self> {
+    pub fn new(locks: Locks, init: &Rigid, source_origin: [f64; 3], target_origin: [f64; 3]) -> Option<Self> {
         locks.any().then(|| Self {
             locks,
             held: parameters(init),

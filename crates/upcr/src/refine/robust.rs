@@ -5,6 +5,7 @@ use serde::Serialize;
 /// Weight of a residual in iteratively re-weighted least squares.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
 #[serde(rename_all = "snake_case")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
 pub enum RobustKernel {
     /// All residuals count alike.
     None,

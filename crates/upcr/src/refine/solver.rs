@@ -87,9 +87,8 @@ impl Objective<'_> {
 
     /// Σ ρ.
     pub fn cost(&self, pose: &Rigid, pairs: &[Correspondence]) -> f64 {
-        let cost = |c: &Correspondence| {
-            self.kernel.weight_and_cost(self.residual(pose, c).squared, self.scale_sq).1
-        };
+        let cost =
+            |c: &Correspondence| self.kernel.weight_and_cost(self.residual(pose, c).squared, self.scale_sq).1;
         let chunks: Vec<f64> = pairs.par_chunks(CHUNK).map(|chunk| chunk.iter().map(cost).sum()).collect();
         chunks.iter().sum()
     }

@@ -22,12 +22,8 @@ pub(crate) fn weakest_direction(hessian: &Matrix6<f64>, radius: f64) -> (Vector6
     let scale = rotation_scale(radius);
     let eigen = SymmetricEigen::new(scale * hessian * scale);
     let most = eigen.eigenvalues.amax();
-    let (index, &least) = eigen
-        .eigenvalues
-        .iter()
-        .enumerate()
-        .min_by(|a, b| a.1.total_cmp(b.1))
-        .unwrap_or((0, &0.0));
+    let (index, &least) =
+        eigen.eigenvalues.iter().enumerate().min_by(|a, b| a.1.total_cmp(b.1)).unwrap_or((0, &0.0));
     (eigen.eigenvectors.column(index).into(), if most > 0.0 { least.max(0.0) / most } else { 0.0 })
 }
 

@@ -64,7 +64,8 @@ pub(crate) fn judge(e: &Evidence) -> Verdict {
     }
     let logit = -6.0 + 8.0 * overlap + 6.0 * e.sharpness + 6.0 * (1.0 - e.runner_up).min(0.5) - 2.0;
     let mut probability = 1.0 / (1.0 + (-logit).exp());
-    if reasons.iter().any(|r| matches!(r, Reason::Ambiguous | Reason::DegenerateAxis | Reason::TooFewPoints)) {
+    if reasons.iter().any(|r| matches!(r, Reason::Ambiguous | Reason::DegenerateAxis | Reason::TooFewPoints))
+    {
         probability *= 0.5;
     }
     Verdict { probability, reasons }
