@@ -17,6 +17,8 @@ const FEATURE_POINTS: usize = 2500;
 const MAX_FEATURE_POINTS: usize = 6000;
 /// Points looked at to choose the scale.
 const SCALE_SAMPLE: usize = 32_768;
+/// Points at which the spacing of a small cloud is measured.
+const SPACING_SAMPLE: usize = 256;
 /// Neighbours of a normal where cells are too sparse to give it.
 const NORMAL_NEIGHBORS: usize = 16;
 /// Mean points a cell from which on cells give normals.
@@ -153,13 +155,16 @@ fn spacing(checked: &Checked) -> f64 {
     const NEIGHBORS: usize = 9;
     let points = local_points(checked.cloud, checked.bounds.center());
     let tree = KdTree::new(&points);
-    let graph = tree.knn_graph(NEIGHBORS);
-    let mut edges: Vec<f32> = (0..graph.len())
-        .filter_map(|i| {
-            let row = graph.row(i);
-            let last = row.last()?;
-            // πr² holds as many points as the row has, itself apart.
-            Some((std::f32::consts::PI * last.distance_sq / (row.len().max(2) - 1) as f32).sqrt())
+    let step = points.len().div_ceil(SPACING_SAMPLE);
+    let mut found = Vec::new();
+    let mut edges: Vec<f32> = points
+        .iter()
+        .step_by(step)
+        .filter_map(|&p| {
+            tree.knn(p, NEIGHBORS, &mut found);
+            // πr² holds as many points as were found, the point itself apart.
+            let last = found.last()?;
+            Some((std::f32::consts::PI * last.distance_sq / (found.len().max(2) - 1) as f32).sqrt())
         })
         .filter(|&edge| edge > 0.0)
         .collect();

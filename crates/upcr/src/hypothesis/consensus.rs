@@ -5,6 +5,7 @@
 //! them. Two wrong matches are compatible by chance; that many others are compatible with both is hardly ever
 //! chance, so the number of common neighbours ranks pairs. No random choice is made.
 
+use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::{Hypothesis, HypothesisSource, Match, Problem};
@@ -12,8 +13,9 @@ use crate::{refine::align, register::Method, transform::Rigid};
 
 /// Matches considered, the most distinctive first.
 const MAX_MATCHES: usize = 1024;
-/// Seeds from which a consensus set is grown.
-const SEEDS: usize = 96;
+/// Seeds looked at, and consensus sets that become poses.
+const SEEDS: usize = 256;
+const CONSENSUSES: usize = 48;
 /// Matches in a seed's first consensus set.
 const CONSENSUS: usize = 20;
 /// Normals of compatible matches enclose the same angle up to this difference of cosines.
@@ -41,11 +43,19 @@ impl HypothesisSource for Consensus {
             .collect();
         seeds.sort_unstable_by_key(|&(degree, i)| (std::cmp::Reverse(degree), i));
         seeds.truncate(SEEDS);
-        let mut hypotheses: Vec<Hypothesis> = seeds
-            .par_iter()
-            .filter(|seed| seed.0 > 0)
-            .filter_map(|&(_, seed)| {
+        // Matches of one consensus lead to one pose: the best of them speaks for the others.
+        let mut spoken_for = vec![false; matches.len()];
+        let mut consensuses = Vec::new();
+        for &(degree, seed) in &seeds {
+            if degree > 0 && !spoken_for[seed as usize] && consensuses.len() < CONSENSUSES {
                 let consensus = graph.consensus(seed as usize);
+                consensus.iter().for_each(|&(i, _)| spoken_for[i] = true);
+                consensuses.push(consensus);
+            }
+        }
+        let mut hypotheses: Vec<Hypothesis> = consensuses
+            .par_iter()
+            .filter_map(|consensus| {
                 let pose = align(consensus.iter().map(|&(i, w)| {
                     let m = &matches[i];
                     (m.source, m.target, w)
@@ -96,23 +106,10 @@ impl Compatibility {
     fn new(matches: &[Match], tolerance: f32) -> Self {
         let count = matches.len();
         let words = count.div_ceil(64);
+        let blocks: Vec<Block> = matches.chunks(64).map(Block::new).collect();
         let mut bits = vec![0u64; words * count];
-        bits.par_chunks_mut(words.max(1)).enumerate().for_each(|(i, row)| {
-            let a = &matches[i];
-            for (word, block) in row.iter_mut().zip(matches.chunks(64)) {
-                let mut mask = 0u64;
-                for (bit, b) in block.iter().enumerate() {
-                    let (ds, dt) = (distance(a.source, b.source), distance(a.target, b.target));
-                    let (cs, ct) =
-                        (dot(a.source_normal, b.source_normal), dot(a.target_normal, b.target_normal));
-                    // Normals have no sign.
-                    let compatible = (ds - dt).abs() < tolerance
-                        && ds > tolerance
-                        && (cs.abs() - ct.abs()).abs() < COSINE_TOLERANCE;
-                    mask |= u64::from(compatible) << bit;
-                }
-                *word = mask;
-            }
+        bits.par_chunks_mut(words.max(1)).with_min_len(32).enumerate().for_each(|(i, row)| {
+            fill_row(&matches[i], &blocks, tolerance, row);
         });
         Self { count, words, bits }
     }
@@ -121,37 +118,94 @@ impl Compatibility {
         &self.bits[i * self.words..(i + 1) * self.words]
     }
 
-    fn common(&self, i: usize, j: usize) -> u32 {
-        self.row(i).iter().zip(self.row(j)).map(|(a, b)| (a & b).count_ones()).sum()
-    }
-
-    fn neighbors(&self, i: usize) -> impl Iterator<Item = usize> + '_ {
-        let row = self.row(i);
-        (0..self.count).filter(move |&j| row[j / 64] >> (j % 64) & 1 == 1)
+    /// With how many matches each match is compatible that is compatible with `i`; zero for those that are not.
+    fn common(&self, i: usize) -> Vec<u32> {
+        let mut common = vec![0; self.count];
+        common_bits(self.row(i), &self.bits, self.words, &mut common);
+        common
     }
 
     /// Σ over compatible matches of the compatible matches in common.
     fn second_order_degree(&self, i: usize) -> u64 {
-        self.neighbors(i).map(|j| u64::from(self.common(i, j))).sum()
+        self.common(i).into_iter().map(u64::from).sum()
     }
 
     /// The seed and the matches with which it has most in common, with that number as weight.
     fn consensus(&self, seed: usize) -> Vec<(usize, f64)> {
-        let mut ranked: Vec<(u32, usize)> = self.neighbors(seed).map(|j| (self.common(seed, j), j)).collect();
+        let mut ranked: Vec<(u32, usize)> =
+            self.common(seed).into_iter().zip(0..).filter(|&(common, _)| common > 0).collect();
         ranked.sort_unstable_by_key(|&(common, j)| (std::cmp::Reverse(common), j));
         ranked.truncate(CONSENSUS);
         let most = ranked.first().map_or(1, |r| r.0).max(1);
         std::iter::once((seed, f64::from(most)))
-            .chain(ranked.into_iter().filter(|r| r.0 > 0).map(|(common, j)| (j, f64::from(common))))
+            .chain(ranked.into_iter().map(|(common, j)| (j, f64::from(common))))
             .collect()
     }
 }
 
-fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
-    let d: [f32; 3] = std::array::from_fn(|k| a[k] - b[k]);
-    dot(d, d).sqrt()
+/// For every bit set in `row`, how many bits that row of `bits` has in common with it.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512vpopcntdq+popcnt", "x86_64+avx2+popcnt"))]
+fn common_bits(row: &[u64], bits: &[u64], words: usize, common: &mut [u32]) {
+    for (j, out) in common.iter_mut().enumerate() {
+        if row[j / 64] >> (j % 64) & 1 == 1 {
+            let other = &bits[j * words..(j + 1) * words];
+            *out = row.iter().zip(other).map(|(a, b)| (a & b).count_ones()).sum();
+        }
+    }
 }
 
-fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
-    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+/// 64 matches by coordinate.
+struct Block {
+    source: [[f32; 64]; 3],
+    target: [[f32; 64]; 3],
+    source_normal: [[f32; 64]; 3],
+    target_normal: [[f32; 64]; 3],
+}
+
+impl Block {
+    /// Up to 64 matches; what is left is filled with NaN, which nothing is compatible with.
+    fn new(matches: &[Match]) -> Self {
+        let mut block = Self {
+            source: [[f32::NAN; 64]; 3],
+            target: [[f32::NAN; 64]; 3],
+            source_normal: [[f32::NAN; 64]; 3],
+            target_normal: [[f32::NAN; 64]; 3],
+        };
+        for (l, m) in matches.iter().enumerate() {
+            for k in 0..3 {
+                block.source[k][l] = m.source[k];
+                block.target[k][l] = m.target[k];
+                block.source_normal[k][l] = m.source_normal[k];
+                block.target_normal[k][l] = m.target_normal[k];
+            }
+        }
+        block
+    }
+}
+
+/// One row of bits: which matches are compatible with `a`. Normals have no sign.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+fn fill_row(a: &Match, blocks: &[Block], tolerance: f32, row: &mut [u64]) {
+    for (word, b) in row.iter_mut().zip(blocks) {
+        let mut compatible = [0u8; 64];
+        for l in 0..64 {
+            let (mut ds, mut dt, mut cs, mut ct) = (0.0, 0.0, 0.0, 0.0);
+            for k in 0..3 {
+                ds += (b.source[k][l] - a.source[k]) * (b.source[k][l] - a.source[k]);
+                dt += (b.target[k][l] - a.target[k]) * (b.target[k][l] - a.target[k]);
+                cs += b.source_normal[k][l] * a.source_normal[k];
+                ct += b.target_normal[k][l] * a.target_normal[k];
+            }
+            let same_length = (ds.sqrt() - dt.sqrt()).abs() < tolerance;
+            let apart = ds > tolerance * tolerance;
+            let same_angle = (cs.abs() - ct.abs()).abs() < COSINE_TOLERANCE;
+            compatible[l] = u8::from(same_length & apart & same_angle);
+        }
+        *word = 0;
+        for (byte, eight) in compatible.as_chunks::<8>().0.iter().enumerate() {
+            // Gathers the lowest bits of eight bytes.
+            let gathered = u64::from_le_bytes(*eight).wrapping_mul(0x0102_0408_1020_4080) >> 56;
+            *word |= gathered << (8 * byte);
+        }
+    }
 }

@@ -1,5 +1,6 @@
 //! Matches between the features of two clouds.
 
+use multiversion::multiversion;
 use rayon::prelude::*;
 
 use nalgebra::Vector3;
@@ -7,7 +8,11 @@ use nalgebra::Vector3;
 use crate::{features::Descriptors, prepare::Level, transform::Rigid};
 
 /// Descriptor rows compared at a time: a block of distances stays in cache.
-const BLOCK: usize = 64;
+const BLOCK: usize = 32;
+/// Blocks a parallel task takes.
+const BLOCKS_PER_TASK: usize = 8;
+/// Columns looked at together.
+const LANES: usize = 16;
 
 /// A source point and the target point whose feature is most like its own.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -56,14 +61,13 @@ struct Best {
 impl Best {
     const NONE: Self = Self { index: 0, distance_sq: f32::INFINITY, second_sq: f32::INFINITY };
 
-    fn offer(&mut self, index: u32, distance_sq: f32) {
-        if distance_sq < self.distance_sq {
-            self.second_sq = self.distance_sq;
-            self.distance_sq = distance_sq;
-            self.index = index;
-        } else if distance_sq < self.second_sq {
-            self.second_sq = distance_sq;
-        }
+    /// The better of two, the lower index where they are equal.
+    fn or(self, other: Self) -> Self {
+        let (first, last) = match self.distance_sq.total_cmp(&other.distance_sq).then(self.index.cmp(&other.index)) {
+            std::cmp::Ordering::Greater => (other, self),
+            _ => (self, other),
+        };
+        Self { second_sq: first.second_sq.min(last.distance_sq), ..first }
     }
 }
 
@@ -72,47 +76,103 @@ fn match_features(source: &Descriptors, target: &Descriptors) -> Vec<(u32, u32, 
     if source.is_empty() || target.is_empty() {
         return Vec::new();
     }
-    let (forward, backward) = rayon::join(|| nearest_rows(source, target), || nearest_rows(target, source));
+    let (forward, backward) = nearest_rows(source, target);
     forward
         .iter()
         .enumerate()
         .map(|(i, best)| {
             let ratio = if best.second_sq > 0.0 { (best.distance_sq / best.second_sq).sqrt() } else { 1.0 };
-            (i as u32, best.index, ratio, backward[best.index as usize].index == i as u32)
+            (i as u32, best.index, ratio, backward[best.index as usize] == i as u32)
         })
         .collect()
 }
 
-/// For every row of `queries` its nearest of `rows`, by blocks of one matrix product each.
-fn nearest_rows(queries: &Descriptors, rows: &Descriptors) -> Vec<Best> {
-    let dim = rows.dim;
-    let norms: Vec<f32> = (0..rows.len()).map(|j| rows.row(j).iter().map(|v| v * v).sum::<f32>()).collect();
-    let blocks: Vec<Vec<Best>> = (0..queries.len().div_ceil(BLOCK))
+/// For every row of `a` its nearest of `b`, and for every row of `b` the index of its nearest of `a`: one matrix
+/// product, by blocks of rows of `a`.
+fn nearest_rows(a: &Descriptors, b: &Descriptors) -> (Vec<Best>, Vec<u32>) {
+    let squares = |d: &Descriptors| -> Vec<f32> {
+        (0..d.len()).map(|i| d.row(i).iter().map(|v| v * v).sum()).collect()
+    };
+    let (a_sq, b_sq) = (squares(a), squares(b));
+    let blocks: Vec<(Vec<Best>, Columns)> = (0..a.len().div_ceil(BLOCK * BLOCKS_PER_TASK))
         .into_par_iter()
-        .map_init(
-            || vec![0.0f32; BLOCK * rows.len()],
-            |products, block| {
-                let first = block * BLOCK;
-                let count = BLOCK.min(queries.len() - first);
-                let a = &queries.values[first * dim..(first + count) * dim];
-                multiply_transposed(a, &rows.values, count, rows.len(), dim, products);
-                (0..count)
-                    .map(|i| {
-                        let norm: f32 = queries.row(first + i).iter().map(|v| v * v).sum();
-                        let line = &products[i * rows.len()..(i + 1) * rows.len()];
-                        let mut best = Best::NONE;
-                        for (j, (&product, &n)) in line.iter().zip(&norms).enumerate() {
-                            best.offer(j as u32, n - 2.0 * product);
-                        }
-                        best.distance_sq = (best.distance_sq + norm).max(0.0);
-                        best.second_sq = (best.second_sq + norm).max(0.0);
-                        best
-                    })
-                    .collect()
-            },
-        )
+        .map(|task| {
+            let mut products = vec![0.0f32; BLOCK * b.len()];
+            let mut columns = Columns { distance_sq: vec![f32::INFINITY; b.len()], index: vec![0; b.len()] };
+            let mut rows = Vec::with_capacity(BLOCK * BLOCKS_PER_TASK);
+            let start = task * BLOCK * BLOCKS_PER_TASK;
+            for first in (start..a.len().min(start + BLOCK * BLOCKS_PER_TASK)).step_by(BLOCK) {
+                let count = BLOCK.min(a.len() - first);
+                multiply_transposed(
+                    &a.values[first * a.dim..(first + count) * a.dim],
+                    &b.values,
+                    count,
+                    b.len(),
+                    a.dim,
+                    &mut products,
+                );
+                for i in 0..count {
+                    let line = &mut products[i * b.len()..(i + 1) * b.len()];
+                    let best = scan_row(line, a_sq[first + i], &b_sq, (first + i) as u32, &mut columns);
+                    rows.push(best);
+                }
+            }
+            (rows, columns)
+        })
         .collect();
-    blocks.concat()
+    let mut rows = Vec::with_capacity(a.len());
+    let mut columns = Columns { distance_sq: vec![f32::INFINITY; b.len()], index: vec![0; b.len()] };
+    for (part, theirs) in blocks {
+        rows.extend(part);
+        for j in 0..b.len() {
+            if theirs.distance_sq[j] < columns.distance_sq[j] {
+                columns.distance_sq[j] = theirs.distance_sq[j];
+                columns.index[j] = theirs.index[j];
+            }
+        }
+    }
+    (rows, columns.index)
+}
+
+/// For every column the least distance so far and the row that has it.
+struct Columns {
+    distance_sq: Vec<f32>,
+    index: Vec<u32>,
+}
+
+/// Turns a row of products into squared distances, updates the columns and finds the row's best.
+#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+fn scan_row(line: &mut [f32], a_sq: f32, b_sq: &[f32], row: u32, columns: &mut Columns) -> Best {
+    for (d, n) in line.iter_mut().zip(b_sq) {
+        *d = (a_sq + n - 2.0 * *d).max(0.0);
+    }
+    for ((d, best), index) in line.iter().zip(&mut columns.distance_sq).zip(&mut columns.index) {
+        let better = *d < *best;
+        *best = if better { *d } else { *best };
+        *index = if better { row } else { *index };
+    }
+    // Each lane keeps its own best and second best; they meet at the end.
+    let (mut least, mut second, mut at) = ([f32::INFINITY; LANES], [f32::INFINITY; LANES], [0u32; LANES]);
+    let (chunks, rest) = line.as_chunks::<LANES>();
+    for (c, chunk) in chunks.iter().enumerate() {
+        for l in 0..LANES {
+            let d = chunk[l];
+            let better = d < least[l];
+            second[l] = second[l].min(if better { least[l] } else { d });
+            least[l] = if better { d } else { least[l] };
+            at[l] = if better { c as u32 } else { at[l] };
+        }
+    }
+    let mut best = Best::NONE;
+    for l in 0..LANES.min(line.len()) {
+        let index = at[l] * LANES as u32 + l as u32;
+        best = best.or(Best { index, distance_sq: least[l], second_sq: second[l] });
+    }
+    for (l, &d) in rest.iter().enumerate() {
+        let index = (chunks.len() * LANES + l) as u32;
+        best = best.or(Best { index, distance_sq: d, second_sq: f32::INFINITY });
+    }
+    best
 }
 
 /// `c = a bᵀ` for row-major `a` (m × k) and `b` (n × k).
