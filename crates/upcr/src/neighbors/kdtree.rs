@@ -36,7 +36,7 @@ pub struct KdTree {
 /// An inner node: no point left of it is above `at` along `axis`, none right of it below.
 #[derive(Debug, Clone, Copy, Default)]
 struct Split {
-    axis: usize,
+    axis: u32,
     at: f32,
 }
 
@@ -54,10 +54,10 @@ struct Leaf {
 #[derive(Clone, Copy, Default)]
 struct Cell {
     /// Its first inner node and first leaf.
-    split: usize,
-    leaf: usize,
+    split: u32,
+    leaf: u32,
     /// How many leaves it has.
-    leaves: usize,
+    leaves: u32,
     /// From its nearest point to the query, and the square of that.
     offset: [f32; 3],
     distance_sq: f32,
@@ -175,47 +175,63 @@ impl KdTree {
         }
         Neighborhoods { offsets, neighbors: rows.concat() }
     }
+}
 
-    /// Calls `scan` with every leaf that may hold a point within the bound, near ones first. `scan` takes and
-    /// returns the bound, a squared distance.
+/// A walk through the leaves that may hold a point within a bound, near ones first.
+struct Walk<'a> {
+    tree: &'a KdTree,
+    query: [f32; 3],
+    stack: [Cell; MAX_DEPTH],
+    depth: usize,
+}
+
+impl<'a> Walk<'a> {
     #[inline(always)]
-    fn visit(&self, query: [f32; 3], mut bound: f32, mut scan: impl FnMut(&Leaf, f32) -> f32) {
-        let offset = std::array::from_fn(|a| query[a] - query[a].max(self.min[a]).min(self.max[a]));
-        let mut cell =
-            Cell { offset, distance_sq: norm_sq(offset), leaves: self.leaves.len(), ..Cell::default() };
+    fn new(tree: &'a KdTree, query: [f32; 3]) -> Self {
+        let offset = std::array::from_fn(|a| query[a] - query[a].max(tree.min[a]).min(tree.max[a]));
+        let root = Cell {
+            offset,
+            distance_sq: norm_sq(offset),
+            leaves: tree.leaves.len() as u32,
+            ..Cell::default()
+        };
         let mut stack = [Cell::default(); MAX_DEPTH];
-        let mut depth = 0;
-        loop {
-            if cell.leaves > 0 && cell.distance_sq <= bound {
+        stack[0] = root;
+        Self { tree, query, stack, depth: usize::from(!tree.is_empty()) }
+    }
+
+    /// The next leaf that may hold a point within `bound`, a squared distance that must not grow.
+    #[inline(always)]
+    fn next(&mut self, bound: f32) -> Option<&'a Leaf> {
+        while self.depth > 0 {
+            self.depth -= 1;
+            let mut cell = self.stack[self.depth];
+            if cell.distance_sq <= bound {
                 while cell.leaves > 1 {
-                    let Split { axis, at } = self.splits[cell.split];
+                    let Split { axis, at } = self.tree.splits[cell.split as usize];
                     let left = cell.leaves.div_ceil(2);
-                    let mut below = Cell { split: cell.split + 1, leaves: left, ..cell };
-                    let mut above = Cell {
+                    let below = Cell { split: cell.split + 1, leaves: left, ..cell };
+                    let above = Cell {
                         split: cell.split + left,
                         leaf: cell.leaf + left,
                         leaves: cell.leaves - left,
                         ..cell
                     };
-                    let to_split = query[axis] - at;
-                    let far = if to_split < 0.0 { &mut above } else { &mut below };
+                    let axis = axis as usize;
+                    let to_split = self.query[axis] - at;
+                    let (near, mut far) = if to_split < 0.0 { (below, above) } else { (above, below) };
                     far.offset[axis] = to_split;
                     far.distance_sq = norm_sq(far.offset);
-                    let (near, far) = if to_split < 0.0 { (below, above) } else { (above, below) };
                     if far.distance_sq <= bound {
-                        stack[depth] = far;
-                        depth += 1;
+                        self.stack[self.depth] = far;
+                        self.depth += 1;
                     }
                     cell = near;
                 }
-                bound = scan(&self.leaves[cell.leaf], bound);
+                return Some(&self.tree.leaves[cell.leaf as usize]);
             }
-            if depth == 0 {
-                return;
-            }
-            depth -= 1;
-            cell = stack[depth];
         }
+        None
     }
 }
 
@@ -234,7 +250,7 @@ fn build(entries: &mut [Entry], splits: &mut [Split], leaves: &mut [Leaf]) {
     let left = leaves.len().div_ceil(2);
     let (_, &mut (median, _), _) =
         entries.select_nth_unstable_by(left * LEAF, |a, b| a.0[axis].total_cmp(&b.0[axis]));
-    *root = Split { axis, at: median[axis] };
+    *root = Split { axis: axis as u32, at: median[axis] };
 
     let parallel = leaves.len() > SEQUENTIAL_LEAVES;
     let (entries_below, entries_above) = entries.split_at_mut(left * LEAF);
@@ -254,19 +270,20 @@ fn build(entries: &mut [Entry], splits: &mut [Split], leaves: &mut [Leaf]) {
 #[multiversion(targets("x86_64+avx2"))]
 fn nearest(tree: &KdTree, query: [f32; 3], best: Neighbor) -> Option<Neighbor> {
     let mut best = best;
-    tree.visit(query, best.distance_sq, |leaf, _| {
+    let mut walk = Walk::new(tree, query);
+    while let Some(leaf) = walk.next(best.distance_sq) {
         let distances_sq = leaf.distances_sq(query);
-        let least = distances_sq.iter().fold(f32::INFINITY, |a, &b| if b < a { b } else { a });
-        if least <= best.distance_sq {
+        // Non-negative floats order as their bits do, and NaN's bits are above all.
+        let least = distances_sq.iter().fold(u32::MAX, |least, d| least.min(d.to_bits()));
+        if f32::from_bits(least) <= best.distance_sq {
             // The first of equals has the lowest index.
-            let lane = distances_sq.iter().position(|&d| d == least).unwrap_or(0);
-            let found = Neighbor { index: leaf.index[lane], distance_sq: least };
+            let lane = distances_sq.iter().position(|d| d.to_bits() == least).unwrap_or(0);
+            let found = Neighbor { index: leaf.index[lane], distance_sq: distances_sq[lane] };
             if found.rank() < best.rank() {
                 best = found;
             }
         }
-        best.distance_sq
-    });
+    }
     (best.index != u32::MAX).then_some(best)
 }
 
@@ -288,7 +305,9 @@ fn collect_into(tree: &KdTree, query: [f32; 3], bound: f32, max: usize, found: &
     let room = max.min(tree.len()).saturating_mul(2) + LEAF;
     found.resize(room.min(256), VACANT);
     let mut len = 0;
-    tree.visit(query, bound, |leaf, mut bound| {
+    let mut bound = bound;
+    let mut walk = Walk::new(tree, query);
+    while let Some(leaf) = walk.next(bound) {
         if len + LEAF > found.len() {
             if found.len() < room {
                 found.resize((2 * found.len()).min(room), VACANT);
@@ -307,8 +326,7 @@ fn collect_into(tree: &KdTree, query: [f32; 3], bound: f32, max: usize, found: &
             hits += usize::from(distances_sq[l] <= bound);
         }
         len += hits;
-        bound
-    });
+    }
     found.truncate(len);
     if len > max {
         found.select_nth_unstable_by_key(max - 1, Neighbor::rank);
