@@ -1,14 +1,16 @@
 //! First step of the pipeline: check a cloud once, shift it to a local origin, choose the scale, downsample.
 
+use std::borrow::Cow;
+
 use rayon::prelude::*;
 
 use crate::{
     CloudRole, Error, PointCloud, Result,
     cloud::{
-        Bounds, local_planes, plane_normal,
+        Bounds, nearest_planes, plane_normal,
         voxel::{Cell, VoxelGrid, count_occupied, smallest_voxel_size},
     },
-    neighbors::KdTree,
+    neighbors::{KdTree, Neighborhoods},
 };
 
 /// Points that carry features: enough to describe a room, few enough to match in milliseconds.
@@ -16,10 +18,14 @@ const FEATURE_POINTS: usize = 2500;
 /// The most points that may carry features where the user's voxel size asks for more.
 const MAX_FEATURE_POINTS: usize = 6000;
 /// Points looked at to choose the scale.
-const SCALE_SAMPLE: usize = 32_768;
+const SCALE_SAMPLE: usize = 8192;
 /// Points at which the spacing of a small cloud is measured.
 const SPACING_SAMPLE: usize = 256;
-/// Neighbours of a normal where cells are too sparse to give it.
+/// Reach of a feature.
+const FEATURE_RADIUS_VOXELS: f32 = 5.0;
+/// Neighbours that a feature looks at, at most.
+const FEATURE_NEIGHBORS: usize = 48;
+/// Neighbours of a normal where cells are too sparse to give it: the nearest of them.
 const NORMAL_NEIGHBORS: usize = 16;
 /// Mean points a cell from which on cells give normals.
 const DENSE_CELL: f64 = 4.0;
@@ -44,6 +50,8 @@ pub(crate) struct Level {
     pub voxel_size: f32,
     /// Largest distance of a point from the local origin.
     pub radius: f32,
+    /// Neighbourhoods that features look at, where they were needed already.
+    graph: Option<Neighborhoods>,
 }
 
 /// A cloud ready to be registered.
@@ -99,25 +107,31 @@ pub(crate) fn check(cloud: &PointCloud, role: CloudRole) -> Result<Checked<'_>> 
     Ok(Checked { cloud, bounds, role })
 }
 
-/// Whether no point leaves the line through the two most distant corners of the cloud.
+/// Whether no point leaves the line through the first point and the one most distant from it.
 fn is_collinear(cloud: &PointCloud, bounds: &Bounds) -> bool {
     const TOLERANCE: f64 = 1e-6;
-    let first = cloud.points[0];
+    let limit = TOLERANCE * bounds.diagonal();
+    // A few points mostly settle it.
+    let few: Vec<[f64; 3]> = cloud.points.iter().step_by(cloud.len().div_ceil(100)).copied().collect();
+    on_a_line(&few, limit) && on_a_line(&cloud.points, limit)
+}
+
+fn on_a_line(points: &[[f64; 3]], limit: f64) -> bool {
+    let first = points[0];
     let minus = |a: [f64; 3], b: [f64; 3]| [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
     let norm_sq = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>();
     let mut far = [0.0; 3];
-    for &p in &cloud.points {
+    for &p in points {
         let d = minus(p, first);
         if norm_sq(d) > norm_sq(far) {
             far = d;
         }
     }
-    let length_sq = norm_sq(far);
-    let limit = (TOLERANCE * bounds.diagonal()).powi(2);
-    cloud.points.iter().all(|&p| {
+    let length_sq = norm_sq(far).max(f64::MIN_POSITIVE);
+    points.iter().all(|&p| {
         let d = minus(p, first);
         let along = (d[0] * far[0] + d[1] * far[1] + d[2] * far[2]) / length_sq;
-        norm_sq(std::array::from_fn(|k| d[k] - along * far[k])) <= limit
+        norm_sq(std::array::from_fn(|k| d[k] - along * far[k])) <= limit * limit
     })
 }
 
@@ -140,7 +154,7 @@ fn natural_voxel_size(checked: &Checked) -> f64 {
     let mut occupied = 0;
     for _ in 0..6 {
         occupied = count_occupied(&sample, bounds.min, coarse.max(floor)).max(1);
-        let ratio = occupied as f64 / FEATURE_POINTS as f64;
+        let ratio = occupied as f64 / crate::tune("FP", FEATURE_POINTS as f64);
         if (0.95..1.05).contains(&ratio) {
             break;
         }
@@ -199,12 +213,12 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Res
     if cloud.len() <= FEATURE_POINTS && grid.cells.len() * 10 >= cloud.len() * 4 {
         // The scale is the cloud's own spacing: keep the samples themselves.
         let points = local_points(cloud, origin);
-        return Ok(Prepared { origin, diagonal, fine: Level::sparse(points, voxel_size), coarse: None });
+        return Ok(Prepared { origin, diagonal, fine: Level::sparse(points, voxel_size, features), coarse: None });
     }
-    let fine = Level::from_grid(&grid, voxel_size);
+    let fine = Level::from_grid(&grid, voxel_size, features);
     let mut coarse = None;
     let mut size = voxel_size;
-    if features && grid.cells.len() > FEATURE_POINTS {
+    if features && grid.cells.len() > crate::tune("FP", FEATURE_POINTS as f64) as usize {
         loop {
             grid = grid.coarsened();
             size *= 2.0;
@@ -212,26 +226,31 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Res
                 break;
             }
         }
-        coarse = Some(Level::from_grid(&grid, size));
+        coarse = Some(Level::from_grid(&grid, size, features));
     }
     Ok(Prepared { origin, diagonal, fine, coarse })
 }
 
 impl Level {
     /// Every point as it is, normals from its nearest neighbours.
-    fn sparse(points: Vec<[f32; 3]>, voxel_size: f64) -> Self {
+    fn sparse(points: Vec<[f32; 3]>, voxel_size: f64, features: bool) -> Self {
         let tree = KdTree::new(&points);
-        let planes = local_planes(&points, &tree.knn_graph(NORMAL_NEIGHBORS));
+        let graph = if features {
+            feature_graph(&tree, voxel_size as f32)
+        } else {
+            tree.knn_graph(NORMAL_NEIGHBORS)
+        };
+        let planes = nearest_planes(&points, &graph, NORMAL_NEIGHBORS);
         let normals = planes.iter().map(|p| p.normal).collect();
-        Self::new(points, normals, tree, voxel_size)
+        Self { graph: features.then_some(graph), ..Self::new(points, normals, tree, voxel_size) }
     }
 
     /// One point a cell, normals from the points in and around it.
-    fn from_grid(grid: &VoxelGrid, voxel_size: f64) -> Self {
+    fn from_grid(grid: &VoxelGrid, voxel_size: f64, features: bool) -> Self {
         let points: Vec<[f32; 3]> = grid.cells.iter().map(|c| c.mean().map(|v| v as f32)).collect();
         let total: f64 = grid.cells.iter().map(|c| c.count).sum();
         if total < DENSE_CELL * points.len() as f64 {
-            return Self::sparse(points, voxel_size);
+            return Self::sparse(points, voxel_size, features);
         }
         let (tree, normals) = rayon::join(
             || KdTree::new(&points),
@@ -248,7 +267,15 @@ impl Level {
 
     fn new(points: Vec<[f32; 3]>, normals: Vec<[f32; 3]>, tree: KdTree, voxel_size: f64) -> Self {
         let radius_sq = points.iter().map(|p| p.iter().map(|v| v * v).sum::<f32>()).fold(0.0, f32::max);
-        Self { points, normals, tree, voxel_size: voxel_size as f32, radius: radius_sq.sqrt() }
+        Self { points, normals, tree, voxel_size: voxel_size as f32, radius: radius_sq.sqrt(), graph: None }
+    }
+
+    /// Neighbourhoods that features look at.
+    pub fn feature_graph(&self) -> Cow<'_, Neighborhoods> {
+        match &self.graph {
+            Some(graph) => Cow::Borrowed(graph),
+            None => Cow::Owned(feature_graph(&self.tree, self.voxel_size)),
+        }
     }
 
     /// At most `count` point indices, spread evenly over `indices`.
@@ -256,6 +283,10 @@ impl Level {
         let step = indices.len().div_ceil(count.max(1)).max(1);
         indices.iter().step_by(step).copied().collect()
     }
+}
+
+fn feature_graph(tree: &KdTree, voxel_size: f32) -> Neighborhoods {
+    tree.radius_graph(FEATURE_RADIUS_VOXELS * voxel_size, crate::tune("FN", FEATURE_NEIGHBORS as f64) as usize)
 }
 
 fn normal_of(cell: &Cell) -> [f32; 3] {

@@ -215,10 +215,15 @@ const SURE: f64 = 0.9;
 /// Hypotheses that are refined on the coarse level, and of those on the fine one.
 const COARSE_CANDIDATES: usize = 8;
 const FINE_CANDIDATES: usize = 3;
-/// Points that score a raw hypothesis, that refine it coarsely, and that score a refined one.
-const RANKING_POINTS: usize = 256;
-const COARSE_POINTS: usize = 400;
+/// A hypothesis that scores less than this share of the best is not looked at further.
+const PROMISING: f64 = 0.7;
+/// Points that score a raw hypothesis, that refine it coarsely, that score it then, and that score the result.
+const RANKING_POINTS: usize = 192;
+const COARSE_POINTS: usize = 300;
+const COMPARING_POINTS: usize = 500;
 const SCORING_POINTS: usize = 1500;
+/// Iterations of the final refinement at most.
+const MAX_ITERATIONS: usize = 30;
 /// Points that refine the final pose at most.
 const FINE_POINTS: usize = 6000;
 /// Scales over which refined poses are compared, each half the one before.
@@ -250,7 +255,8 @@ struct Candidate {
 
 fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
     let start = Instant::now();
-    let (source, target) = (check(source, CloudRole::Source)?, check(target, CloudRole::Target)?);
+    let (source, target) = rayon::join(|| check(source, CloudRole::Source), || check(target, CloudRole::Target));
+    let (source, target) = (source?, target?);
     let voxel_size = match settings.voxel_size {
         Some(v) if v.is_finite() && v > 0.0 => v,
         Some(v) => {
@@ -378,12 +384,11 @@ impl<'a> Pipeline<'a> {
         };
         let mut ranked: Vec<(f64, Hypothesis)> =
             hypotheses.par_iter().map(|h| (rank(&h.pose, RANKING_POINTS), *h)).collect();
-        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
-        ranked.truncate(COARSE_CANDIDATES);
+        keep_promising(&mut ranked, COARSE_CANDIDATES);
 
         let moved = all(source, COARSE_POINTS);
         let schedule =
-            Schedule { max_distance: (2.0 * limit, limit), shrink_over: 4, max_iterations: 8, keep: 1.0 };
+            Schedule { max_distance: (2.0 * limit, limit), shrink_over: 4, max_iterations: 6, keep: 1.0 };
         let factor = factor(self.settings.refine);
         let lock = self.lock.as_ref();
         if self.settings.refine != Refinement::None {
@@ -392,19 +397,20 @@ impl<'a> Pipeline<'a> {
                 .map(|(_, h)| {
                     let kernel = self.settings.kernel;
                     let refined = refine(source, &moved, target, &h.pose, factor, kernel, &schedule, lock);
-                    (rank(&refined.pose, SCORING_POINTS), Hypothesis { pose: refined.pose, ..*h })
+                    (rank(&refined.pose, COMPARING_POINTS), Hypothesis { pose: refined.pose, ..*h })
                 })
                 .collect();
-            ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         }
+        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         let radius = f64::from(self.source.fine.radius);
-        let mut distinct: Vec<Hypothesis> = Vec::new();
-        for (_, h) in ranked {
-            let new = |d: &Hypothesis| separation(&d.pose, &h.pose, radius) > f64::from(limit);
-            if distinct.len() < FINE_CANDIDATES && distinct.iter().all(new) {
-                distinct.push(h);
+        let mut distinct: Vec<(f64, Hypothesis)> = Vec::new();
+        for (score, h) in ranked {
+            if distinct.iter().all(|(_, d)| separation(&d.pose, &h.pose, radius) > f64::from(limit)) {
+                distinct.push((score, h));
             }
         }
+        keep_promising(&mut distinct, FINE_CANDIDATES);
+        let distinct: Vec<Hypothesis> = distinct.into_iter().map(|(_, h)| h).collect();
         for h in distinct {
             let candidate = self.finely_refined(&h);
             self.candidates.push(candidate);
@@ -416,7 +422,7 @@ impl<'a> Pipeline<'a> {
         let (source, target) = (&self.source.fine, &self.target.fine);
         let voxel = self.voxel_size as f32;
         let lock = self.lock.as_ref();
-        let iterations = if self.settings.refine == Refinement::None { 0 } else { 30 };
+        let iterations = if self.settings.refine == Refinement::None { 0 } else { MAX_ITERATIONS };
         let first = if hypothesis.method == Method::Prior { 6.0 } else { 3.0 };
         let schedule = Schedule {
             max_distance: (first * voxel, voxel),
@@ -509,15 +515,19 @@ impl<'a> Pipeline<'a> {
     }
 }
 
+/// Keeps the best `count` at most, and of those only what scores nearly as well as the best.
+fn keep_promising(scored: &mut Vec<(f64, Hypothesis)>, count: usize) {
+    scored.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let enough = scored.first().map_or(0.0, |best| PROMISING * best.0);
+    scored.retain(|&(score, _)| score >= enough);
+    scored.truncate(count);
+}
+
 /// Matched points lie this many coarse voxels apart at most under a right pose.
 const TOLERANCE_VOXELS: f32 = 1.5;
 
-/// Reach of a feature, and the most neighbours it looks at.
-const FEATURE_RADIUS_VOXELS: f32 = 5.0;
-const FEATURE_NEIGHBORS: usize = 100;
-
 fn describe(level: &Level) -> Result<Descriptors> {
-    let neighborhoods = level.tree.radius_graph(FEATURE_RADIUS_VOXELS * level.voxel_size, FEATURE_NEIGHBORS);
+    let neighborhoods = level.feature_graph();
     let mut normals = level.normals.clone();
     orient_by_curvature(&level.points, &mut normals, &neighborhoods);
     let input = FeatureInput { points: &level.points, normals: &normals, neighborhoods: &neighborhoods };

@@ -78,11 +78,17 @@ impl PointCloud {
 
 /// Fits a plane to every point's neighbourhood, in parallel.
 pub fn local_planes(points: &[[f32; 3]], neighborhoods: &Neighborhoods) -> Vec<LocalPlane> {
+    nearest_planes(points, neighborhoods, usize::MAX)
+}
+
+/// As [`local_planes`], from the `k` nearest neighbours of each point alone.
+pub(crate) fn nearest_planes(points: &[[f32; 3]], neighborhoods: &Neighborhoods, k: usize) -> Vec<LocalPlane> {
     let mut planes =
         vec![LocalPlane { normal: [0.0; 3], eigenvalues: [0.0; 3] }; points.len().min(neighborhoods.len())];
     planes.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, planes)| {
         for (plane, i) in planes.iter_mut().zip(chunk * CHUNK..) {
-            *plane = fit_plane(points, points[i], neighborhoods.row(i));
+            let row = neighborhoods.row(i);
+            *plane = fit_plane(points, points[i], &row[..row.len().min(k)]);
         }
     });
     planes

@@ -12,10 +12,10 @@ use super::{Hypothesis, HypothesisSource, Match, Problem};
 use crate::{refine::align, register::Method, transform::Rigid};
 
 /// Matches considered, the most distinctive first.
-const MAX_MATCHES: usize = 1024;
+const MAX_MATCHES: usize = 512;
 /// Seeds looked at, and consensus sets that become poses.
 const SEEDS: usize = 256;
-const CONSENSUSES: usize = 48;
+const CONSENSUSES: usize = 32;
 /// Matches in a seed's first consensus set.
 const CONSENSUS: usize = 20;
 /// Normals of compatible matches enclose the same angle up to this difference of cosines.
@@ -47,7 +47,7 @@ impl HypothesisSource for Consensus {
         let mut spoken_for = vec![false; matches.len()];
         let mut consensuses = Vec::new();
         for &(degree, seed) in &seeds {
-            if degree > 0 && !spoken_for[seed as usize] && consensuses.len() < CONSENSUSES {
+            if degree > 0 && !spoken_for[seed as usize] && consensuses.len() < crate::tune("CO", CONSENSUSES as f64) as usize {
                 let consensus = graph.consensus(seed as usize);
                 consensus.iter().for_each(|&(i, _)| spoken_for[i] = true);
                 consensuses.push(consensus);
@@ -75,7 +75,7 @@ impl HypothesisSource for Consensus {
 fn most_distinctive(matches: &[Match]) -> Vec<Match> {
     let mut chosen = matches.to_vec();
     chosen.sort_by(|a, b| b.mutual.cmp(&a.mutual).then(a.ratio.total_cmp(&b.ratio)));
-    chosen.truncate(MAX_MATCHES);
+    chosen.truncate(crate::tune("MM", MAX_MATCHES as f64) as usize);
     chosen
 }
 

@@ -12,7 +12,13 @@ use crate::{prepare::Level, transform::Rigid};
 /// Source points are matched in blocks of this many; the blocks' results stand in order.
 const BLOCK: usize = 256;
 /// Surfaces that face more than this far apart (cosine) are not the same surface.
-const NORMAL_COSINE: f64 = 0.5;
+const NORMAL_COSINE: f32 = 0.5;
+/// No target point was near.
+const NOTHING: u32 = u32::MAX;
+/// Residuals that tell the kernel's scale.
+const SCALE_SAMPLE: usize = 1024;
+/// Motion in voxels, at the target's rim, under which the pose has settled.
+const SETTLED_VOXELS: f64 = 2e-3;
 
 /// How far and how long to look for correspondences.
 #[derive(Debug, Clone, Copy)]
@@ -60,10 +66,11 @@ pub(crate) fn refine(
     };
     let (first, last) = schedule.max_distance;
     let mut damping = MIN_DAMPING;
+    let mut nearest = vec![NOTHING; moved.len()];
     for iteration in 0..schedule.max_iterations {
         let along = (iteration as f32 / schedule.shrink_over.max(1) as f32).min(1.0);
         let max_distance = first * (last / first).powf(along);
-        let mut pairs = correspondences(source, moved, target, &refined.pose, max_distance);
+        let mut pairs = correspondences(source, moved, target, &refined.pose, max_distance, &mut nearest);
         keep_closest(&mut pairs, &refined.pose, schedule.keep);
         if pairs.len() < 6 {
             refined.converged = false;
@@ -79,12 +86,12 @@ pub(crate) fn refine(
         let motion = next * refined.pose.inverse();
         let moved_by = motion.angle() * f64::from(target.radius) + motion.translation.norm();
         refined.pose = next;
-        if along >= 1.0 && moved_by < f64::from(1e-3 * source.voxel_size) {
+        if along >= 1.0 && moved_by < SETTLED_VOXELS * f64::from(source.voxel_size) {
             refined.converged = true;
             break;
         }
     }
-    let mut pairs = correspondences(source, moved, target, &refined.pose, last);
+    let mut pairs = correspondences(source, moved, target, &refined.pose, last, &mut nearest);
     keep_closest(&mut pairs, &refined.pose, schedule.keep);
     if pairs.len() < 6 {
         refined.converged = false;
@@ -101,7 +108,7 @@ pub(crate) fn refine(
 /// search radius allows.
 fn scale_sq(factor: &dyn Factor, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> f64 {
     let plain = Objective { factor, kernel: RobustKernel::None, scale_sq: 1.0 };
-    let mut squares: Vec<f64> = pairs.iter().map(|c| plain.squared(pose, c)).collect();
+    let mut squares: Vec<f64> = pairs.iter().step_by(pairs.len().div_ceil(SCALE_SAMPLE)).map(|c| plain.squared(pose, c)).collect();
     let middle = squares.len() / 2;
     let median_sq = *squares.select_nth_unstable_by(middle, f64::total_cmp).1;
     // 1.4826² turns a squared median into a variance; three standard deviations.
@@ -124,33 +131,40 @@ fn keep_closest(pairs: &mut Vec<Correspondence>, pose: &Rigid, keep: f64) {
 }
 
 /// Pairs each point of `moved` with its nearest target point, where one is near and faces the same way.
+///
+/// `nearest` holds the last iteration's answers, from which the search starts, and takes this one's.
 fn correspondences(
     source: &Level,
     moved: &[u32],
     target: &Level,
     pose: &Rigid,
     max_distance: f32,
+    nearest: &mut [u32],
 ) -> Vec<Correspondence> {
     let rotation = pose.rotation.map(|v| v as f32);
     let translation = pose.translation.map(|v| v as f32);
     let blocks: Vec<Vec<Correspondence>> = moved
         .par_chunks(BLOCK)
-        .map(|block| {
+        .zip(nearest.par_chunks_mut(BLOCK))
+        .map(|(block, nearest)| {
             let mut found = Vec::with_capacity(block.len());
-            for &i in block {
+            for (&i, nearest) in block.iter().zip(nearest) {
                 let p = source.points[i as usize];
                 let y = rotation * Vector3::from(p) + translation;
-                let Some(nearest) = target.tree.nearest(y.into(), max_distance * max_distance) else {
-                    continue;
+                let limit_sq = max_distance * max_distance;
+                let neighbor = match *nearest {
+                    NOTHING => target.tree.nearest(y.into(), limit_sq),
+                    hint => target.tree.nearest_with_hint(y.into(), limit_sq, hint),
                 };
-                let (m, n) = (source.normals[i as usize], target.normals[nearest.index as usize]);
-                let cosine = f64::from((rotation * Vector3::from(m)).dot(&Vector3::from(n)));
-                if cosine.abs() < NORMAL_COSINE {
+                *nearest = neighbor.map_or(NOTHING, |n| n.index);
+                let Some(neighbor) = neighbor else { continue };
+                let (m, n) = (source.normals[i as usize], target.normals[neighbor.index as usize]);
+                if (rotation * Vector3::from(m)).dot(&Vector3::from(n)).abs() < NORMAL_COSINE {
                     continue;
                 }
                 found.push(Correspondence {
                     source: p,
-                    target: target.points[nearest.index as usize],
+                    target: target.points[neighbor.index as usize],
                     source_normal: m,
                     target_normal: n,
                 });
