@@ -237,12 +237,23 @@ const DISTINCT_VOXELS: f64 = 6.0;
 /// Where a cloud is too small, degenerate or not finite, or a setting is out of its range. Clouds that cannot
 /// be registered are no error: the result says so (`probability`, `reasons`).
 pub fn register(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
-    let Some(threads) = settings.threads else { return run(source, target, settings) };
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(threads.get())
-        .build()
-        .map_err(|e| Error::InvalidSetting { name: "threads", reason: e.to_string() })?;
-    pool.install(|| run(source, target, settings))
+    if let Some(overlap) = settings.overlap
+        && !(overlap > 0.0 && overlap <= 1.0)
+    {
+        return Err(Error::InvalidSetting {
+            name: "overlap",
+            reason: format!("must be a share above 0 and at most 1, not {overlap}"),
+        });
+    }
+    match settings.threads {
+        // From inside the pool every parallel step starts without waking a thread first.
+        None => rayon::scope(|_| run(source, target, settings)),
+        Some(threads) => rayon::ThreadPoolBuilder::new()
+            .num_threads(threads.get())
+            .build()
+            .map_err(|e| Error::InvalidSetting { name: "threads", reason: e.to_string() })?
+            .install(|| run(source, target, settings)),
+    }
 }
 
 /// A refined pose with its score.

@@ -1,8 +1,10 @@
 //! Our features against those of Open3D and PCL; `golden/README.md` says how theirs were made.
 
+#![allow(clippy::unwrap_used)]
+
 use std::path::Path;
 
-use upcr::features::{Descriptors, Feature, FeatureInput, Fpfh, Pfh, Spfh};
+use upcr::features::{self, Descriptors, Feature, FeatureInput, Fpfh, Pfh, Spfh};
 use upcr::neighbors::{KdTree, Neighborhoods};
 
 const RADIUS: f32 = 0.5;
@@ -65,4 +67,15 @@ fn spfh_is_that_of_pcl() {
 #[test]
 fn pfh_is_that_of_pcl() {
     assert_agrees(&compute(&Pfh, |tree| tree.knn_graph(24)), "pcl_pfh.txt");
+}
+
+#[test]
+fn the_number_of_threads_changes_no_bit() {
+    for feature in features::ALL {
+        let with = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| compute(*feature, within_radius))
+        };
+        assert_eq!(with(1), with(4), "{}", feature.name());
+    }
 }

@@ -80,7 +80,7 @@ pub struct Descriptors {
 impl Descriptors {
     /// Number of rows.
     pub fn len(&self) -> usize {
-        if self.dim == 0 { 0 } else { self.values.len() / self.dim }
+        self.values.len().checked_div(self.dim).unwrap_or(0)
     }
 
     /// Whether there is no row.
@@ -110,7 +110,7 @@ mod tests {
             let found = feature.compute(&input).unwrap();
             assert_eq!((found.dim, found.len()), (feature.dim(3), 4), "{}", feature.name());
             assert!(found.values.iter().all(|v| v.is_finite()), "{}", feature.name());
-            assert_eq!(by_name(feature.name()).map(|f| f.name()), Some(feature.name()));
+            assert_eq!(by_name(feature.name()).map(Feature::name), Some(feature.name()));
         }
     }
 

@@ -16,6 +16,7 @@ pub struct Neighbor {
 impl Neighbor {
     /// Orders by distance, then by index: non-negative floats order as their bits do.
     #[inline(always)]
+    #[allow(clippy::trivially_copy_pass_by_ref)] // as the sorting functions call it
     pub(crate) fn rank(&self) -> u64 {
         u64::from(self.distance_sq.to_bits()) << 32 | u64::from(self.index)
     }

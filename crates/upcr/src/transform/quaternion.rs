@@ -39,7 +39,7 @@ mod tests {
 
     #[test]
     fn known_values() {
-        assert_eq!(from_rotation(&Matrix3::identity()), [1.0, 0.0, 0.0, 0.0]);
+        assert_eq!(to_rotation([2.0, 0.0, 0.0, 0.0]), Some(Matrix3::identity()));
         let half_turn = Matrix3::from_diagonal(&Vector3::new(-1.0, -1.0, 1.0));
         assert_eq!(to_rotation([0.0, 0.0, 0.0, 1.0]), Some(half_turn));
         assert_eq!(to_rotation([0.0; 4]), None);
