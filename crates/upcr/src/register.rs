@@ -224,8 +224,10 @@ const COMPARING_POINTS: usize = 500;
 const SCORING_POINTS: usize = 1500;
 /// Iterations of the final refinement at most.
 const MAX_ITERATIONS: usize = 30;
-/// Points that refine the final pose at most.
+/// Points that refine a pose until it settles, and in a few last iterations.
+const FEW_POINTS: usize = 1500;
 const FINE_POINTS: usize = 6000;
+const LAST_ITERATIONS: usize = 4;
 /// Scales over which refined poses are compared, each half the one before.
 const SCORING_SCALES: u32 = 4;
 /// Poses closer than this many voxels at the source's rim are one answer.
@@ -278,12 +280,6 @@ fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<
         }
         None => derive_voxel_size(&source, &target),
     };
-    if let Some(share) = settings.overlap
-        && !(share > 0.0 && share <= 1.0)
-    {
-        let reason = format!("must lie between 0 (excluded) and 1, not {share}");
-        return Err(Error::InvalidSetting { name: "overlap", reason });
-    }
     let features = settings.method != Method::Prior;
     let (source, target) =
         rayon::join(|| prepare(&source, voxel_size, features), || prepare(&target, voxel_size, features));
@@ -441,10 +437,18 @@ impl<'a> Pipeline<'a> {
             max_iterations: iterations,
             keep: self.settings.overlap.unwrap_or(1.0),
         };
-        let moved = Level::thin(&self.source.refined_points(), FINE_POINTS);
         let factor = factor(self.settings.refine);
         let kernel = self.settings.kernel;
-        let refined = refine(source, &moved, target, &hypothesis.pose, factor, kernel, &schedule, lock);
+        let all_moved = self.source.refined_points();
+        let few = Level::thin(&all_moved, crate::tune("FEW", FEW_POINTS as f64) as usize);
+        let mut refined = refine(source, &few, target, &hypothesis.pose, factor, kernel, &schedule, lock);
+        if few.len() < all_moved.len() && iterations > 0 {
+            let schedule = Schedule { max_distance: (voxel, voxel), max_iterations: LAST_ITERATIONS, ..schedule };
+            let moved = Level::thin(&all_moved, FINE_POINTS);
+            let before = refined.iterations;
+            refined = refine(source, &moved, target, &refined.pose, factor, kernel, &schedule, lock);
+            refined.iterations += before;
+        }
         let all =
             |level: &Level| Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), SCORING_POINTS);
         let limit = 2.0 * voxel;

@@ -5,6 +5,9 @@ use crate::PointCloud;
 /// Cell coordinates are kept below this so that three of them fit one 64-bit key.
 const MAX_CELLS_PER_AXIS: f64 = (1u64 << 21) as f64;
 
+/// Occupied cells of a typical grid: room for so many is made at once.
+const TYPICAL_CELLS: usize = 16_384;
+
 /// What fell into one cell: sums about the grid's corner, and how many points.
 ///
 /// The second moments make the surface normal a by-product of the one pass over the points.
@@ -77,7 +80,11 @@ impl VoxelGrid {
         corner: [f64; 3],
         voxel_size: f64,
     ) -> Self {
-        let mut grid = Self { cells: Vec::new(), keys: Vec::new(), table: CellTable::with_capacity(4096) };
+        let mut grid = Self {
+            cells: Vec::with_capacity(TYPICAL_CELLS),
+            keys: Vec::with_capacity(TYPICAL_CELLS),
+            table: CellTable::with_capacity(2 * TYPICAL_CELLS),
+        };
         let scale = 1.0 / voxel_size;
         let (mut last_key, mut last_cell) = (EMPTY, 0);
         for p in points {
@@ -113,18 +120,14 @@ impl VoxelGrid {
         grid
     }
 
-    /// Moments of cell `i` and the up to 26 occupied cells around it.
+    /// Moments of cell `i` and the occupied ones of the six that share a face with it.
     pub fn surroundings(&self, i: usize) -> Cell {
-        let mut sum = Cell::default();
+        let mut sum = self.cells[i];
         let [x, y, z] = unpack(self.keys[i]);
-        for dx in 0..3 {
-            for dy in 0..3 {
-                for dz in 0..3 {
-                    // Keys are stored one up (see `key_of`), so one below never wraps.
-                    if let Some(j) = self.table.get(pack([x + dx - 1, y + dy - 1, z + dz - 1])) {
-                        sum.merge(&self.cells[j as usize]);
-                    }
-                }
+        // Keys are stored one up (see `key_of`), so one below never wraps.
+        for near in [[x - 1, y, z], [x + 1, y, z], [x, y - 1, z], [x, y + 1, z], [x, y, z - 1], [x, y, z + 1]] {
+            if let Some(j) = self.table.get(pack(near)) {
+                sum.merge(&self.cells[j as usize]);
             }
         }
         sum

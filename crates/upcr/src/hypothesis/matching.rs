@@ -9,6 +9,8 @@ use crate::{features::Descriptors, prepare::Level, transform::Rigid};
 
 /// Descriptor rows compared at a time: a block of distances stays in cache.
 const BLOCK: usize = 32;
+/// Features of a cloud that are matched, at most.
+const MAX_ROWS: usize = 1000;
 /// Blocks a parallel task takes.
 const BLOCKS_PER_TASK: usize = 8;
 /// Columns looked at together.
@@ -35,19 +37,45 @@ impl Match {
     }
 }
 
-/// The match of every source point.
+/// The match of every distinctive source point.
 pub(crate) fn match_levels(source: (&Level, &Descriptors), target: (&Level, &Descriptors)) -> Vec<Match> {
-    match_features(source.1, target.1)
+    let ((from, from_rows), (to, to_rows)) = (distinctive(source.1), distinctive(target.1));
+    match_features(&from_rows, &to_rows)
         .into_iter()
+        .map(|(i, j, ratio, mutual)| (from[i as usize], to[j as usize], ratio, mutual))
         .map(|(i, j, ratio, mutual)| Match {
-            source: source.0.points[i as usize],
-            target: target.0.points[j as usize],
-            source_normal: source.0.normals[i as usize],
-            target_normal: target.0.normals[j as usize],
+            source: source.0.points[i],
+            target: target.0.points[j],
+            source_normal: source.0.normals[i],
+            target_normal: target.0.normals[j],
             ratio,
             mutual,
         })
         .collect()
+}
+
+/// The rows that differ most from the cloud's mean, [`MAX_ROWS`] at most, and their indices, ascending.
+///
+/// What most of a scan looks like (walls, floors) tells no place from another; Rusu et al. (IROS 2008) keep the
+/// points whose histogram is far from the mean for the same reason.
+fn distinctive(all: &Descriptors) -> (Vec<usize>, Descriptors) {
+    let most = crate::tune("MR", MAX_ROWS as f64) as usize;
+    if all.len() <= most {
+        return ((0..all.len()).collect(), all.clone());
+    }
+    let mut mean = vec![0.0f64; all.dim];
+    for i in 0..all.len() {
+        mean.iter_mut().zip(all.row(i)).for_each(|(m, &v)| *m += f64::from(v));
+    }
+    let mean: Vec<f32> = mean.iter().map(|m| (m / all.len() as f64) as f32).collect();
+    let mut ranked: Vec<(f32, usize)> = (0..all.len())
+        .map(|i| (all.row(i).iter().zip(&mean).map(|(v, m)| (v - m) * (v - m)).sum(), i))
+        .collect();
+    ranked.select_nth_unstable_by(most, |a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    let mut kept: Vec<usize> = ranked[..most].iter().map(|r| r.1).collect();
+    kept.sort_unstable();
+    let values = kept.iter().flat_map(|&i| all.row(i)).copied().collect();
+    (kept, Descriptors { dim: all.dim, values })
 }
 
 /// Nearest row of another set: its index, its squared distance, and that of the second nearest.
