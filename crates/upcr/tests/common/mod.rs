@@ -74,7 +74,12 @@ impl Pair {
     /// Target and source in each other's place.
     #[must_use]
     pub fn reversed(self) -> Self {
-        Self { source: self.target, target: self.source, truth: self.truth.inverse(), name: self.name }
+        Self {
+            source: self.target,
+            target: self.source,
+            truth: self.truth.inverse(),
+            name: format!("reversed {}", self.name),
+        }
     }
 
     /// How far `found` is off.
