@@ -1,5 +1,7 @@
 //! Our features against those of Open3D and PCL; `golden/README.md` says how theirs were made.
 
+#![allow(clippy::unwrap_used)]
+
 use std::path::Path;
 
 use upcr::features::{Descriptors, Feature, FeatureInput, Fpfh, Pfh, Spfh};

@@ -1,6 +1,6 @@
 //! One pair with a known pose through everything a user can choose, and everything that cannot be registered.
 
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::panic)]
 
 mod common;
 
@@ -254,7 +254,7 @@ fn clouds_that_are_none() {
 fn hardly_clouds() {
     let good = sheet(30, 1.0, bumps);
     let triangle = PointCloud::from_points(vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]);
-    let mut doubled = PointCloud::from_points([good.points[0]; 2000].to_vec());
+    let mut doubled = PointCloud::from_points(vec![good.points[0]; 2000]);
     doubled.points.extend_from_slice(&triangle.points);
     let mut outlier = good.clone();
     outlier.points.push([1e12; 3]);

@@ -16,7 +16,7 @@ pub struct Neighbor {
 impl Neighbor {
     /// Orders by distance, then by index: non-negative floats order as their bits do.
     #[inline(always)]
-    pub(crate) fn rank(&self) -> u64 {
+    pub(crate) fn rank(self) -> u64 {
         u64::from(self.distance_sq.to_bits()) << 32 | u64::from(self.index)
     }
 }
