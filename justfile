@@ -10,7 +10,7 @@ build:
 sample:
     cargo run --release -p upcr-cli -- register samples/source.ply samples/target.ply
 
-# Run all tests; those on public scans need UPCR_DATA
+# Run all tests; those on public scans say `skipped` where the data is absent
 test:
     cargo test --workspace
 

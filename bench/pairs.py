@@ -350,7 +350,7 @@ def chosen(names: str) -> list[str]:
     for name in wanted:
         absent = [f for f in SETS[name][0] if not (DATA / f).is_dir()]
         if absent:
-            print(f"{name}: skipped, {DATA / absent[0]} is absent", file=sys.stderr)
+            print(f"skipped: {name}, {DATA / absent[0]} is absent", file=sys.stderr)
         else:
             present.append(name)
     return present

@@ -3,10 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use upcr::io;
-use upcr_lab::data::scanner::{RangeNoise, Scene, Sensor, SynthSettings, synth};
+use upcr_lab::data::scanner::{Optics, RangeNoise, Scene, Sensor, SynthSettings, synth};
 
 use crate::output::{self, Progress};
 
@@ -39,10 +39,25 @@ pub struct Args {
     /// Turn every scan about its sensor by a random rotation
     #[arg(long)]
     turned: bool,
+    /// Image size of a camera in pixels, its field of view staying the same [default: 640x480]
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    size: Option<[usize; 2]>,
+    /// Lasers of a lidar [default: 64]
+    #[arg(long, value_name = "N")]
+    beams: Option<usize>,
+    /// Measurements of each laser in a full turn [default: 1024]
+    #[arg(long, value_name = "N")]
+    azimuth_steps: Option<usize>,
+    /// Shortest and longest range that is measured [default: the sensor's]
+    #[arg(long, value_name = "MIN,MAX", value_parser = range)]
+    range: Option<[f64; 2]>,
     /// Standard deviation of the range noise, alike at all distances; 0 switches all noise off [default: the
     /// sensor's]
     #[arg(long, value_name = "LENGTH", allow_negative_numbers = true)]
     noise: Option<f64>,
+    /// Probability that a ray returns nothing [default: the sensor's]
+    #[arg(long, value_name = "SHARE", allow_negative_numbers = true)]
+    dropout: Option<f64>,
     /// Seed of every random choice
     #[arg(long, default_value_t = SynthSettings::new(Scene::Room).seed)]
     seed: u64,
@@ -81,11 +96,30 @@ impl Args {
             (None, Place::Terrain) => Scene::Terrain,
         };
         let mut settings = SynthSettings::new(scene);
-        match self.sensor {
-            Some(Device::Camera) => settings.sensor = Sensor::HAND_HELD,
-            Some(Device::Lidar) => settings.sensor = Sensor::ON_VEHICLE,
-            None => {}
+        // Where the scene's own sensor is of the kind asked for, it suits the scene better than any other.
+        match (self.sensor, settings.sensor.optics) {
+            (Some(Device::Camera), Optics::Lidar(_)) => settings.sensor = Sensor::HAND_HELD,
+            (Some(Device::Lidar), Optics::DepthCamera(_)) => settings.sensor = Sensor::ON_VEHICLE,
+            _ => {}
         }
+        match &mut settings.sensor.optics {
+            Optics::DepthCamera(_) if self.beams.or(self.azimuth_steps).is_some() => {
+                bail!("--beams and --azimuth-steps are for a lidar, and this sensor is a camera");
+            }
+            Optics::Lidar(_) if self.size.is_some() => {
+                bail!("--size is for a camera, and this sensor is a lidar");
+            }
+            Optics::DepthCamera(camera) => {
+                if let Some([width, height]) = self.size {
+                    *camera = camera.resized(width, height);
+                }
+            }
+            Optics::Lidar(lidar) => {
+                lidar.beams = self.beams.unwrap_or(lidar.beams);
+                lidar.azimuth_steps = self.azimuth_steps.unwrap_or(lidar.azimuth_steps);
+            }
+        }
+        settings.sensor.range_m = self.range.unwrap_or(settings.sensor.range_m);
         match self.noise {
             Some(0.0) => settings.sensor.noise = RangeNoise::NONE,
             Some(constant_m) => {
@@ -94,6 +128,8 @@ impl Args {
             }
             None => {}
         }
+        let noise = &mut settings.sensor.noise;
+        noise.dropout = self.dropout.unwrap_or(noise.dropout);
         Ok(SynthSettings {
             scans: self.scans,
             overlap: self.overlap,
@@ -102,6 +138,17 @@ impl Args {
             ..settings
         })
     }
+}
+
+fn size(text: &str) -> Result<[usize; 2]> {
+    let (width, height) = text.split_once('x').context("two numbers with an x between them are needed")?;
+    Ok([width.trim().parse()?, height.trim().parse()?])
+}
+
+fn range(text: &str) -> Result<[f64; 2]> {
+    let (shortest, longest) =
+        text.split_once(',').context("two lengths with a comma between them are needed")?;
+    Ok([shortest.trim().parse()?, longest.trim().parse()?])
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {

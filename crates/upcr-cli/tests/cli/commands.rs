@@ -136,6 +136,69 @@ fn synth_writes_scans_that_register_to_their_poses() {
     assert!(degrees < 1.0 && offset < 2.0 * voxel, "off by {degrees}° and {offset}");
 }
 
+/// The samples are what the command in their README makes.
+#[test]
+fn synth_makes_the_samples() {
+    let scratch = Scratch::new();
+    let readme = std::fs::read_to_string(sample("README.md")).unwrap();
+    let command =
+        readme.lines().find_map(|line| line.strip_prefix("upcr ")).expect("the README has the command");
+    let out = scratch.path("scans");
+    let words = command.split_whitespace().map(|word| if word == "scans" { &out } else { word });
+    let run = upcr(words);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    for (made, kept) in [("scan_001.ply", "source.ply"), ("scan_000.ply", "target.ply")] {
+        let [made, kept] =
+            [format!("{out}/{made}"), sample(kept)].map(|f| upcr(["info", &f, "--json"]).json());
+        assert_eq!(made["points"], kept["points"]);
+        for key in ["min", "max"] {
+            for axis in 0..3 {
+                let [a, b] = [&made, &kept].map(|info| info[key][axis].as_f64().unwrap());
+                assert!((a - b).abs() < 1e-9, "{key}: {a} {b}");
+            }
+        }
+    }
+    let [made, kept] = [format!("{out}/T_000_001.txt"), sample("T_target_source.txt")].map(numbers);
+    assert!(made.iter().zip(&kept).all(|(a, b)| (a - b).abs() < 1e-9), "{made:?} {kept:?}");
+}
+
+#[test]
+fn synth_scans_with_the_sensor_that_is_asked_for() {
+    let scratch = Scratch::new();
+    let points = |options: &str| {
+        let out = scratch.path("scans");
+        let run =
+            upcr(["synth", "--scans", "1", "--out", &out].into_iter().chain(options.split_whitespace()));
+        assert_eq!(run.status, 0, "{}", run.stderr);
+        upcr(["info", &format!("{out}/scan_000.ply"), "--json"]).json()["points"].as_u64().unwrap()
+    };
+    let whole = points("--scene room --size 160x120 --noise 0");
+    assert!((10_000..=160 * 120).contains(&whole), "{whole} points");
+    let half = points("--scene room --size 160x120 --noise 0 --dropout 0.5");
+    assert!((half as f64 / whole as f64 - 0.5).abs() < 0.05, "{half} of {whole} points");
+    let near = points("--scene room --size 160x120 --noise 0 --range 0.3,2");
+    assert!(near < whole, "{near} of {whole} points");
+    let lidar = points("--scene room --sensor lidar --beams 16 --azimuth-steps 100 --noise 0");
+    assert!((800..=1600).contains(&lidar), "{lidar} points");
+
+    let out = scratch.path("none");
+    for (options, word) in [
+        ("--scene street --size 64x48", "--size"),
+        ("--scene room --beams 16", "--beams"),
+        ("--scene room --size 0x10", "sensor"),
+        ("--scene room --dropout 1.5", "dropout"),
+        ("--scene room --range 2,1", "range_m"),
+        ("--scene room --noise -1", "noise"),
+    ] {
+        let run = upcr(["synth", "--out", &out].into_iter().chain(options.split_whitespace()));
+        run.assert_fails(1, &[word]);
+    }
+    for option in ["--size=64", "--size=axb", "--range=1", "--range=a,b"] {
+        upcr(["synth", "--out", &out, option]).assert_fails(2, &[&option[..6]]);
+    }
+    assert!(!std::path::Path::new(&out).exists());
+}
+
 #[test]
 fn help_tells_the_exit_statuses() {
     let run = upcr(["--help"]);

@@ -199,7 +199,8 @@ pub(crate) fn smallest_eigenpair(m: &Matrix3<f64>) -> ([f64; 3], Vector3<f64>) {
     let v = axis.cross(&u);
     let (uu, uv, vv) = (u.dot(&(a * u)), u.dot(&(a * v)), v.dot(&(a * v)));
     let half_gap = ((uu - vv) / 2.0).hypot(uv);
-    let (low, high) = (uu.midpoint(vv) - half_gap, uu.midpoint(vv) + half_gap);
+    let middle = f64::midpoint(uu, vv);
+    let (low, high) = (middle - half_gap, middle + half_gap);
     let isolated = axis.dot(&(a * axis));
 
     if largest_is_isolated {
