@@ -32,7 +32,7 @@ const DENSE_CELL: f64 = 4.0;
 /// Points without which no pose is determined.
 const FEWEST_POINTS: usize = 3;
 /// Every so-many-th point is kept from the refinement and used by the verification alone.
-const HOLD_OUT_EVERY: usize = 4;
+const HOLD_OUT_EVERY: u32 = 4;
 
 /// A cloud that passed the checks, with the numbers that later steps need.
 pub(crate) struct Checked<'a> {
@@ -50,6 +50,8 @@ pub(crate) struct Level {
     pub voxel_size: f32,
     /// Largest distance of a point from the local origin.
     pub radius: f32,
+    /// Whether the points are samples as they were taken, not averages of many.
+    pub sparse: bool,
     /// Neighbourhoods that features look at, where they were needed already.
     graph: Option<Neighborhoods>,
 }
@@ -86,7 +88,7 @@ impl Prepared {
 /// A fixed pseudo-random quarter of all indices.
 fn is_held_out(index: u32) -> bool {
     // A stride would follow scan lines; the hash does not.
-    (index.wrapping_mul(0x9E37_79B9) >> 16) as usize % HOLD_OUT_EVERY == 0
+    (index.wrapping_mul(0x9E37_79B9) >> 16).is_multiple_of(HOLD_OUT_EVERY)
 }
 
 /// Checks that `cloud` is finite, large enough and more than a line.
@@ -242,7 +244,7 @@ impl Level {
         };
         let planes = nearest_planes(&points, &graph, NORMAL_NEIGHBORS);
         let normals = planes.iter().map(|p| p.normal).collect();
-        Self { graph: features.then_some(graph), ..Self::new(points, normals, tree, voxel_size) }
+        Self { sparse: true, graph: features.then_some(graph), ..Self::new(points, normals, tree, voxel_size) }
     }
 
     /// One point a cell, normals from the points in and around it.
@@ -267,7 +269,7 @@ impl Level {
 
     fn new(points: Vec<[f32; 3]>, normals: Vec<[f32; 3]>, tree: KdTree, voxel_size: f64) -> Self {
         let radius_sq = points.iter().map(|p| p.iter().map(|v| v * v).sum::<f32>()).fold(0.0, f32::max);
-        Self { points, normals, tree, voxel_size: voxel_size as f32, radius: radius_sq.sqrt(), graph: None }
+        Self { points, normals, tree, voxel_size: voxel_size as f32, radius: radius_sq.sqrt(), sparse: false, graph: None }
     }
 
     /// Neighbourhoods that features look at.

@@ -222,6 +222,8 @@ const RANKING_POINTS: usize = 192;
 const COARSE_POINTS: usize = 300;
 const COMPARING_POINTS: usize = 500;
 const SCORING_POINTS: usize = 1500;
+/// Pairs of the final refinement are at most so many voxels apart.
+const REACH_VOXELS: f32 = 2.0;
 /// Iterations of the final refinement at most.
 const MAX_ITERATIONS: usize = 30;
 /// Points that refine a pose until it settles, and in a few last iterations.
@@ -246,6 +248,9 @@ pub fn register(source: &PointCloud, target: &PointCloud, settings: &Settings) -
             name: "overlap",
             reason: format!("must be a share above 0 and at most 1, not {overlap}"),
         });
+    }
+    if let Some(init) = &settings.init {
+        Rigid::from_rows(&init.to_rows()).map_err(|reason| Error::InvalidSetting { name: "init", reason })?;
     }
     match settings.threads {
         // From inside the pool every parallel step starts without waking a thread first.
@@ -396,7 +401,7 @@ impl<'a> Pipeline<'a> {
         let moved = all(source, COARSE_POINTS);
         let schedule =
             Schedule { max_distance: (2.0 * limit, limit), shrink_over: 4, max_iterations: 6, keep: 1.0 };
-        let factor = factor(self.settings.refine);
+        let factor = factor(self.settings.refine, source.sparse && target.sparse);
         let lock = self.lock.as_ref();
         if self.settings.refine != Refinement::None {
             ranked = ranked
@@ -430,20 +435,21 @@ impl<'a> Pipeline<'a> {
         let voxel = self.voxel_size as f32;
         let lock = self.lock.as_ref();
         let iterations = if self.settings.refine == Refinement::None { 0 } else { MAX_ITERATIONS };
+        let reach = REACH_VOXELS * voxel;
         let first = if hypothesis.method == Method::Prior { 6.0 } else { 3.0 };
         let schedule = Schedule {
-            max_distance: (first * voxel, voxel),
+            max_distance: (first * voxel, reach),
             shrink_over: 6,
             max_iterations: iterations,
             keep: self.settings.overlap.unwrap_or(1.0),
         };
-        let factor = factor(self.settings.refine);
+        let factor = factor(self.settings.refine, source.sparse && target.sparse);
         let kernel = self.settings.kernel;
         let all_moved = self.source.refined_points();
-        let few = Level::thin(&all_moved, crate::tune("FEW", FEW_POINTS as f64) as usize);
+        let few = Level::thin(&all_moved, FEW_POINTS);
         let mut refined = refine(source, &few, target, &hypothesis.pose, factor, kernel, &schedule, lock);
         if few.len() < all_moved.len() && iterations > 0 {
-            let schedule = Schedule { max_distance: (voxel, voxel), max_iterations: LAST_ITERATIONS, ..schedule };
+            let schedule = Schedule { max_distance: (reach, reach), max_iterations: LAST_ITERATIONS, ..schedule };
             let moved = Level::thin(&all_moved, FINE_POINTS);
             let before = refined.iterations;
             refined = refine(source, &moved, target, &refined.pose, factor, kernel, &schedule, lock);

@@ -62,7 +62,7 @@ fn graduate(mut pose: Rigid, pairs: &[Correspondence], diagonal: f32, tolerance:
     let mut damping = 0.0;
     loop {
         let objective =
-            Objective { factor: factor(Refinement::Point), kernel: RobustKernel::GemanMcclure, scale_sq: mu };
+            Objective { factor: factor(Refinement::Point, true), kernel: RobustKernel::GemanMcclure, scale_sq: mu };
         for _ in 0..STEPS_PER_SCALE {
             match objective.step(&pose, pairs, None, &mut damping) {
                 Some(next) => pose = next,

@@ -59,8 +59,7 @@ pub(crate) fn match_levels(source: (&Level, &Descriptors), target: (&Level, &Des
 /// What most of a scan looks like (walls, floors) tells no place from another; Rusu et al. (IROS 2008) keep the
 /// points whose histogram is far from the mean for the same reason.
 fn distinctive(all: &Descriptors) -> (Vec<usize>, Descriptors) {
-    let most = crate::tune("MR", MAX_ROWS as f64) as usize;
-    if all.len() <= most {
+    if all.len() <= MAX_ROWS {
         return ((0..all.len()).collect(), all.clone());
     }
     let mut mean = vec![0.0f64; all.dim];
@@ -71,8 +70,8 @@ fn distinctive(all: &Descriptors) -> (Vec<usize>, Descriptors) {
     let mut ranked: Vec<(f32, usize)> = (0..all.len())
         .map(|i| (all.row(i).iter().zip(&mean).map(|(v, m)| (v - m) * (v - m)).sum(), i))
         .collect();
-    ranked.select_nth_unstable_by(most, |a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-    let mut kept: Vec<usize> = ranked[..most].iter().map(|r| r.1).collect();
+    ranked.select_nth_unstable_by(MAX_ROWS, |a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    let mut kept: Vec<usize> = ranked[..MAX_ROWS].iter().map(|r| r.1).collect();
     kept.sort_unstable();
     let values = kept.iter().flat_map(|&i| all.row(i)).copied().collect();
     (kept, Descriptors { dim: all.dim, values })

@@ -18,7 +18,7 @@ const NOTHING: u32 = u32::MAX;
 /// Residuals that tell the kernel's scale.
 const SCALE_SAMPLE: usize = 1024;
 /// Motion in voxels, at the target's rim, under which the pose has settled.
-const SETTLED_VOXELS: f64 = 2e-3;
+const SETTLED_VOXELS: f64 = 1e-2;
 
 /// How far and how long to look for correspondences.
 #[derive(Debug, Clone, Copy)]
@@ -81,7 +81,10 @@ pub(crate) fn refine(
         refined.iterations = iteration + 1;
         let Some(next) = objective.step(&refined.pose, &pairs, lock, &mut damping) else {
             refined.converged = along >= 1.0;
-            if refined.converged { break } else { continue }
+            if refined.converged {
+                break;
+            }
+            continue;
         };
         let motion = next * refined.pose.inverse();
         let moved_by = motion.angle() * f64::from(target.radius) + motion.translation.norm();

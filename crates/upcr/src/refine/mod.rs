@@ -30,9 +30,12 @@ pub(crate) trait Factor: Sync {
 }
 
 /// The factor of a refinement; [`Refinement::None`] scores like a point.
-pub(crate) fn factor(refinement: Refinement) -> &'static dyn Factor {
+///
+/// `sparse`: the points are samples as they were taken, not averages of many.
+pub(crate) fn factor(refinement: Refinement, sparse: bool) -> &'static dyn Factor {
     match refinement {
-        Refinement::Gicp => &gicp::PlaneToPlane,
+        Refinement::Gicp if sparse => &gicp::PlaneToPlane::SPARSE,
+        Refinement::Gicp => &gicp::PlaneToPlane::DENSE,
         Refinement::Plane => &plane::PointToPlane,
         Refinement::Point | Refinement::None => &point::PointToPoint,
     }

@@ -158,11 +158,11 @@ impl Objective<'_> {
                     solve_dynamic(hessian, &gradient, *damping).map(|d| lock.step(pose, d.as_slice()))
                 }
             };
-            if let Some(candidate) = candidate {
-                if self.cost(&candidate, pairs) <= model.cost {
-                    *damping = (*damping * 0.1).max(MIN_DAMPING);
-                    return Some(candidate);
-                }
+            if let Some(candidate) = candidate
+                && self.cost(&candidate, pairs) <= model.cost
+            {
+                *damping = (*damping * 0.1).max(MIN_DAMPING);
+                return Some(candidate);
             }
             *damping *= 10.0;
         }
@@ -175,9 +175,10 @@ pub(crate) const MIN_DAMPING: f64 = 1e-9;
 
 fn solve(hessian: &Matrix6<f64>, gradient: &Vector6<f64>, damping: f64) -> Option<Vector6<f64>> {
     let mut h = *hessian;
-    let floor = MIN_DAMPING * h.diagonal().amax();
+    // Angles and lengths have units of their own, and so do their floors.
+    let floor = [h.diagonal().fixed_rows::<3>(0).amax(), h.diagonal().fixed_rows::<3>(3).amax()];
     for k in 0..6 {
-        h[(k, k)] += damping * h[(k, k)] + floor;
+        h[(k, k)] += damping * h[(k, k)] + MIN_DAMPING * floor[k / 3];
     }
     let step = h.cholesky()?.solve(&-gradient);
     step.iter().all(|v| v.is_finite()).then_some(step)
@@ -187,9 +188,10 @@ fn solve_dynamic(mut hessian: DMatrix<f64>, gradient: &DVector<f64>, damping: f6
     if gradient.is_empty() {
         return Some(DVector::zeros(0));
     }
-    let floor = MIN_DAMPING * hessian.diagonal().amax();
+    // Every free parameter has its own unit, and so its own floor.
     for k in 0..gradient.len() {
-        hessian[(k, k)] += damping * hessian[(k, k)] + floor;
+        hessian[(k, k)] *= 1.0 + damping + MIN_DAMPING;
+        hessian[(k, k)] += f64::MIN_POSITIVE;
     }
     let step = hessian.cholesky()?.solve(&-gradient);
     step.iter().all(|v| v.is_finite()).then_some(step)
