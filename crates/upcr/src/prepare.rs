@@ -14,7 +14,7 @@ use crate::{
 };
 
 /// Points that carry features: enough to describe a room, few enough to match in milliseconds.
-const FEATURE_POINTS: usize = 2500;
+const FEATURE_POINTS: usize = 2000;
 /// The most points that may carry features where the user's voxel size asks for more.
 const MAX_FEATURE_POINTS: usize = 6000;
 /// Points looked at to choose the scale.
@@ -28,7 +28,7 @@ const FEATURE_NEIGHBORS: usize = 48;
 /// Neighbours of a normal where cells are too sparse to give it: the nearest of them.
 const NORMAL_NEIGHBORS: usize = 16;
 /// Mean points a cell from which on cells give normals.
-const DENSE_CELL: f64 = 4.0;
+const DENSE_CELL: f64 = 3.0;
 /// Points without which no pose is determined.
 const FEWEST_POINTS: usize = 3;
 /// Every so-many-th point is kept from the refinement and used by the verification alone.
@@ -156,7 +156,7 @@ fn natural_voxel_size(checked: &Checked) -> f64 {
     let mut occupied = 0;
     for _ in 0..6 {
         occupied = count_occupied(&sample, bounds.min, coarse.max(floor)).max(1);
-        let ratio = occupied as f64 / crate::tune("FP", FEATURE_POINTS as f64);
+        let ratio = occupied as f64 / FEATURE_POINTS as f64;
         if (0.95..1.05).contains(&ratio) {
             break;
         }
@@ -217,18 +217,16 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Res
         let points = local_points(cloud, origin);
         return Ok(Prepared { origin, diagonal, fine: Level::sparse(points, voxel_size, features), coarse: None });
     }
-    let fine = Level::from_grid(&grid, voxel_size, features);
+    let separate = features && grid.cells.len() > FEATURE_POINTS;
+    let fine = Level::from_grid(&grid, voxel_size, features && !separate);
     let mut coarse = None;
-    let mut size = voxel_size;
-    if features && grid.cells.len() > crate::tune("FP", FEATURE_POINTS as f64) as usize {
-        loop {
+    if separate {
+        let mut size = voxel_size;
+        while size == voxel_size || grid.cells.len() > MAX_FEATURE_POINTS {
             grid = grid.coarsened();
             size *= 2.0;
-            if grid.cells.len() <= MAX_FEATURE_POINTS {
-                break;
-            }
         }
-        coarse = Some(Level::from_grid(&grid, size, features));
+        coarse = Some(Level::from_grid(&grid, size, true));
     }
     Ok(Prepared { origin, diagonal, fine, coarse })
 }
@@ -288,7 +286,7 @@ impl Level {
 }
 
 fn feature_graph(tree: &KdTree, voxel_size: f32) -> Neighborhoods {
-    tree.radius_graph(FEATURE_RADIUS_VOXELS * voxel_size, crate::tune("FN", FEATURE_NEIGHBORS as f64) as usize)
+    tree.radius_graph(FEATURE_RADIUS_VOXELS * voxel_size, FEATURE_NEIGHBORS)
 }
 
 fn normal_of(cell: &Cell) -> [f32; 3] {

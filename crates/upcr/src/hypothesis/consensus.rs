@@ -47,9 +47,11 @@ impl HypothesisSource for Consensus {
         let mut spoken_for = vec![false; matches.len()];
         let mut consensuses = Vec::new();
         for &(degree, seed) in &seeds {
-            if degree > 0 && !spoken_for[seed as usize] && consensuses.len() < crate::tune("CO", CONSENSUSES as f64) as usize {
+            if degree > 0 && !spoken_for[seed as usize] && consensuses.len() < CONSENSUSES {
                 let consensus = graph.consensus(seed as usize);
-                consensus.iter().for_each(|&(i, _)| spoken_for[i] = true);
+                for &(i, _) in &consensus {
+                    spoken_for[i] = true;
+                }
                 consensuses.push(consensus);
             }
         }
@@ -75,7 +77,7 @@ impl HypothesisSource for Consensus {
 fn most_distinctive(matches: &[Match]) -> Vec<Match> {
     let mut chosen = matches.to_vec();
     chosen.sort_by(|a, b| b.mutual.cmp(&a.mutual).then(a.ratio.total_cmp(&b.ratio)));
-    chosen.truncate(crate::tune("MM", MAX_MATCHES as f64) as usize);
+    chosen.truncate(MAX_MATCHES);
     chosen
 }
 

@@ -10,7 +10,7 @@ use crate::{features::Descriptors, prepare::Level, transform::Rigid};
 /// Descriptor rows compared at a time: a block of distances stays in cache.
 const BLOCK: usize = 32;
 /// Features of a cloud that are matched, at most.
-const MAX_ROWS: usize = 1000;
+const MAX_ROWS: usize = 800;
 /// Blocks a parallel task takes.
 const BLOCKS_PER_TASK: usize = 8;
 /// Columns looked at together.

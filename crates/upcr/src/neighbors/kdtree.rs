@@ -312,7 +312,7 @@ fn collect_into(tree: &KdTree, query: [f32; 3], bound: f32, max: usize, found: &
             if found.len() < room {
                 found.resize((2 * found.len()).min(room), VACANT);
             } else {
-                let (_, kth, _) = found[..len].select_nth_unstable_by_key(max - 1, |n| n.rank());
+                let (_, kth, _) = found[..len].select_nth_unstable_by_key(max - 1, Neighbor::rank);
                 bound = kth.distance_sq;
                 len = max;
             }
@@ -329,10 +329,10 @@ fn collect_into(tree: &KdTree, query: [f32; 3], bound: f32, max: usize, found: &
     }
     found.truncate(len);
     if len > max {
-        found.select_nth_unstable_by_key(max - 1, |n| n.rank());
+        found.select_nth_unstable_by_key(max - 1, Neighbor::rank);
         found.truncate(max);
     }
-    found.sort_unstable_by_key(|n| n.rank());
+    found.sort_unstable_by_key(Neighbor::rank);
 }
 
 /// The neighbours of the points in `leaves`, in the order of the leaves.
@@ -388,7 +388,7 @@ mod tests {
             .map(|(&p, index)| Neighbor { index, distance_sq: norm_sq(sub(query, p)) })
             .filter(|n| n.distance_sq <= radius_sq)
             .collect();
-        all.sort_by_key(|n| n.rank());
+        all.sort_by_key(Neighbor::rank);
         all.truncate(max);
         all
     }
