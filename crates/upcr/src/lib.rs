@@ -9,15 +9,17 @@ pub mod neighbors;
 mod prepare;
 mod refine;
 mod register;
+mod registration;
+mod settings;
 pub mod transform;
 mod verify;
 
 pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
 pub use refine::RobustKernel;
-pub use register::{
-    Locks, Method, Reason, Refinement, Registration, Settings, TRUSTWORTHY, Timings, register,
-};
+pub use register::register;
+pub use registration::{Reason, Registration, TRUSTWORTHY, Timings};
+pub use settings::{Locks, Method, Refinement, Settings};
 pub use transform::Rigid;
 
 #[cfg(doctest)]

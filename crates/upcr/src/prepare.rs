@@ -215,7 +215,12 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Res
     if cloud.len() <= FEATURE_POINTS && grid.cells.len() * 10 >= cloud.len() * 4 {
         // The scale is the cloud's own spacing: keep the samples themselves.
         let points = local_points(cloud, origin);
-        return Ok(Prepared { origin, diagonal, fine: Level::sparse(points, voxel_size, features), coarse: None });
+        return Ok(Prepared {
+            origin,
+            diagonal,
+            fine: Level::sparse(points, voxel_size, features),
+            coarse: None,
+        });
     }
     let separate = features && grid.cells.len() > FEATURE_POINTS;
     let fine = Level::from_grid(&grid, voxel_size, features && !separate);
@@ -235,14 +240,15 @@ impl Level {
     /// Every point as it is, normals from its nearest neighbours.
     fn sparse(points: Vec<[f32; 3]>, voxel_size: f64, features: bool) -> Self {
         let tree = KdTree::new(&points);
-        let graph = if features {
-            feature_graph(&tree, voxel_size as f32)
-        } else {
-            tree.knn_graph(NORMAL_NEIGHBORS)
-        };
+        let graph =
+            if features { feature_graph(&tree, voxel_size as f32) } else { tree.knn_graph(NORMAL_NEIGHBORS) };
         let planes = nearest_planes(&points, &graph, NORMAL_NEIGHBORS);
         let normals = planes.iter().map(|p| p.normal).collect();
-        Self { sparse: true, graph: features.then_some(graph), ..Self::new(points, normals, tree, voxel_size) }
+        Self {
+            sparse: true,
+            graph: features.then_some(graph),
+            ..Self::new(points, normals, tree, voxel_size)
+        }
     }
 
     /// One point a cell, normals from the points in and around it.
@@ -267,7 +273,15 @@ impl Level {
 
     fn new(points: Vec<[f32; 3]>, normals: Vec<[f32; 3]>, tree: KdTree, voxel_size: f64) -> Self {
         let radius_sq = points.iter().map(|p| p.iter().map(|v| v * v).sum::<f32>()).fold(0.0, f32::max);
-        Self { points, normals, tree, voxel_size: voxel_size as f32, radius: radius_sq.sqrt(), sparse: false, graph: None }
+        Self {
+            points,
+            normals,
+            tree,
+            voxel_size: voxel_size as f32,
+            radius: radius_sq.sqrt(),
+            sparse: false,
+            graph: None,
+        }
     }
 
     /// Neighbourhoods that features look at.

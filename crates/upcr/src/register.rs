@@ -1,10 +1,9 @@
 //! The one pipeline: prepare, hypotheses, refine, verify.
 
-use std::{num::NonZeroUsize, time::Instant};
+use std::time::Instant;
 
 use nalgebra::Matrix6;
 use rayon::prelude::*;
-use serde::Serialize;
 
 use crate::{
     CloudRole, Error, PointCloud, Result,
@@ -12,206 +11,15 @@ use crate::{
     features::{Descriptors, Feature, FeatureInput, Fpfh},
     hypothesis::{Hypothesis, Match, Problem, SOURCES, match_levels, separation},
     prepare::{Level, Prepared, check, derive_voxel_size, prepare},
-    refine::{LockedPose, Refined, RobustKernel, Schedule, factor, refine},
+    refine::{LockedPose, Refined, Schedule, factor, refine},
+    registration::{Reason, Registration, Timings},
+    settings::{Method, Refinement, Settings},
     transform::Rigid,
     verify::{Evidence, covariance, distances, judge, symmetric_score, weakest_direction},
 };
 
-/// Where the first pose comes from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-#[serde(rename_all = "snake_case")]
-#[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
-pub enum Method {
-    /// Cheap sources first, dearer ones until the verifier is sure.
-    #[default]
-    Auto,
-    /// The given initial pose alone (identity where none is given).
-    Prior,
-    /// Fast Global Registration.
-    Fgr,
-    /// Feature RANSAC.
-    Ransac,
-    /// Feature matches that agree with each other (second-order spatial compatibility).
-    Consensus,
-}
-
-/// What the refinement minimises.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-#[serde(rename_all = "snake_case")]
-#[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
-pub enum Refinement {
-    /// Generalized ICP (plane to plane).
-    #[default]
-    Gicp,
-    /// Point to plane.
-    Plane,
-    /// Point to point.
-    Point,
-    /// Nothing: the hypothesis is the answer.
-    None,
-}
-
-/// Degrees of freedom of `T_target_source` that keep the value they have in the initial pose.
-///
-/// Roll, pitch and yaw are the extrinsic x, y, z angles of `R = Rz(yaw) Ry(pitch) Rx(roll)`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-#[allow(clippy::struct_excessive_bools)]
-pub struct Locks {
-    /// Rotation about x.
-    pub roll: bool,
-    /// Rotation about y.
-    pub pitch: bool,
-    /// Rotation about z.
-    pub yaw: bool,
-    /// Translation along x.
-    pub x: bool,
-    /// Translation along y.
-    pub y: bool,
-    /// Translation along z.
-    pub z: bool,
-}
-
-impl Locks {
-    /// Roll, pitch, yaw, x, y, z.
-    pub fn flags(&self) -> [bool; 6] {
-        [self.roll, self.pitch, self.yaw, self.x, self.y, self.z]
-    }
-
-    /// Whether anything is locked.
-    pub fn any(&self) -> bool {
-        self.flags().contains(&true)
-    }
-}
-
-/// All that a registration can be told. `Settings::default()` is meant to be enough.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Settings {
-    /// Where the first pose comes from.
-    pub method: Method,
-    /// What the refinement minimises.
-    pub refine: Refinement,
-    /// The one scale that drives every radius, in the clouds' unit; `None`: derived from the clouds.
-    pub voxel_size: Option<f64>,
-    /// A first guess of `T_target_source`, in the files' frames.
-    pub init: Option<Rigid>,
-    /// How residuals of the refinement are weighed.
-    pub kernel: RobustKernel,
-    /// Share of the closest pairs that the refinement keeps, 0 to 1; `None`: all within reach.
-    pub overlap: Option<f64>,
-    /// Degrees of freedom held at the initial pose's values.
-    pub locks: Locks,
-    /// Seed of every random choice.
-    pub seed: u64,
-    /// Threads to use; `None`: all that the current rayon pool has. The result does not depend on it.
-    pub threads: Option<NonZeroUsize>,
-}
-
-impl Default for Settings {
-    fn default() -> Self {
-        Self {
-            method: Method::Auto,
-            refine: Refinement::Gicp,
-            voxel_size: None,
-            init: None,
-            kernel: RobustKernel::default(),
-            overlap: None,
-            locks: Locks::default(),
-            seed: 0,
-            threads: None,
-        }
-    }
-}
-
-/// What a caveat is about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-#[non_exhaustive]
-pub enum Reason {
-    /// The clouds share no surface at the pose found.
-    NoOverlap,
-    /// They share little.
-    LowOverlap,
-    /// Another, different pose explains the clouds nearly as well.
-    Ambiguous,
-    /// Some direction of motion is not held by the geometry (a plane, a cylinder, a corridor).
-    DegenerateAxis,
-    /// Too few points to tell.
-    TooFewPoints,
-    /// The refinement ran out of iterations.
-    NotConverged,
-}
-
-impl std::fmt::Display for Reason {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::NoOverlap => "the clouds share no surface at the pose found",
-            Self::LowOverlap => "the clouds share little surface at the pose found",
-            Self::Ambiguous => "another, different pose explains the clouds nearly as well",
-            Self::DegenerateAxis => "some direction of motion is not held by the geometry",
-            Self::TooFewPoints => "there are too few points to tell",
-            Self::NotConverged => "the refinement ran out of iterations",
-        })
-    }
-}
-
-/// Milliseconds spent in each step; reading files is no part of it.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
-pub struct Timings {
-    /// Checks, scale, downsampling, normals.
-    pub prepare: f64,
-    /// Features, matching, hypotheses.
-    pub hypotheses: f64,
-    /// Refinement.
-    pub refine: f64,
-    /// Scoring and verdict.
-    pub verify: f64,
-    /// All of it, from call to return.
-    pub total: f64,
-}
-
-/// The one result, whatever the method, always completely filled.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Registration {
-    /// Takes source coordinates to target coordinates, both in their files' own frames: `y = R x + t`.
-    pub T_target_source: Rigid,
-    /// Share of held-out source points with a target point within `voxel_size`, 0 to 1.
-    pub fitness: f64,
-    /// Root mean square distance of those, in the clouds' unit.
-    pub inlier_rmse: f64,
-    /// How many there are.
-    pub num_inliers: usize,
-    /// Whether the refinement settled, with inliers to settle on.
-    pub converged: bool,
-    /// Refinement iterations of the returned pose.
-    pub iterations: usize,
-    /// Probability that the pose is right, 0 to 1.
-    pub probability: f64,
-    /// Covariance of the left twist (rotation rad, translation) of `T_target_source`, about the target's origin.
-    pub covariance: [[f64; 6]; 6],
-    /// What speaks against the pose.
-    pub reasons: Vec<Reason>,
-    /// Which source the winning hypothesis came from.
-    pub method: Method,
-    /// The scale used, in the clouds' unit.
-    pub voxel_size: f64,
-    /// The effective settings.
-    pub settings: Settings,
-    /// Where the time went.
-    pub timings_ms: Timings,
-}
-
-/// Probability from which a pose is called registered.
-pub const TRUSTWORTHY: f64 = 0.5;
-
-impl Registration {
-    /// Whether the pose is more likely right than wrong.
-    pub fn is_trustworthy(&self) -> bool {
-        self.probability >= TRUSTWORTHY
-    }
-}
-
 /// Probability from which no dearer source of hypotheses is asked.
-const SURE: f64 = 0.9;
+const SURE: f64 = 0.75;
 /// Hypotheses that are refined on the coarse level, and of those on the fine one.
 const COARSE_CANDIDATES: usize = 8;
 const FINE_CANDIDATES: usize = 3;
@@ -273,7 +81,8 @@ struct Candidate {
 
 fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
     let start = Instant::now();
-    let (source, target) = rayon::join(|| check(source, CloudRole::Source), || check(target, CloudRole::Target));
+    let (source, target) =
+        rayon::join(|| check(source, CloudRole::Source), || check(target, CloudRole::Target));
     let (source, target) = (source?, target?);
     let voxel_size = match settings.voxel_size {
         Some(v) if v.is_finite() && v > 0.0 => v,
@@ -449,11 +258,15 @@ impl<'a> Pipeline<'a> {
         let few = Level::thin(&all_moved, FEW_POINTS);
         let mut refined = refine(source, &few, target, &hypothesis.pose, factor, kernel, &schedule, lock);
         if few.len() < all_moved.len() && iterations > 0 {
-            let schedule = Schedule { max_distance: (reach, reach), max_iterations: LAST_ITERATIONS, ..schedule };
+            let schedule =
+                Schedule { max_distance: (reach, reach), max_iterations: LAST_ITERATIONS, ..schedule };
             let moved = Level::thin(&all_moved, FINE_POINTS);
-            let before = refined.iterations;
-            refined = refine(source, &moved, target, &refined.pose, factor, kernel, &schedule, lock);
-            refined.iterations += before;
+            let settled = refine(source, &moved, target, &refined.pose, factor, kernel, &schedule, lock);
+            refined = Refined {
+                iterations: refined.iterations + settled.iterations,
+                converged: refined.converged || settled.converged,
+                ..settled
+            };
         }
         let all =
             |level: &Level| Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), SCORING_POINTS);
@@ -480,7 +293,7 @@ impl<'a> Pipeline<'a> {
         let limit = self.voxel_size as f32;
         let forward = distances(source, &self.source.held_out_points(), target, pose, limit);
         let backward = distances(target, &self.target.held_out_points(), source, &pose.inverse(), limit);
-        let (weakest, conditioning) = weakest_direction(&best.refined.hessian, radius);
+        let (weakest, conditioning) = weakest_direction(&best.refined.shape_hessian, radius);
         let _ = weakest;
         let inliers = forward.within(limit) + backward.within(limit);
         let evidence = Evidence {

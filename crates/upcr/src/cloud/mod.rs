@@ -9,8 +9,8 @@ mod summary;
 pub(crate) mod voxel;
 
 pub use bounds::Bounds;
-pub(crate) use normals::{nearest_planes, plane_normal};
 pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
+pub(crate) use normals::{nearest_planes, plane_normal};
 pub use outliers::statistical_inliers;
 pub use sample::{farthest_points, random_indices};
 pub use summary::Summary;

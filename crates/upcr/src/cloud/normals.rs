@@ -82,7 +82,11 @@ pub fn local_planes(points: &[[f32; 3]], neighborhoods: &Neighborhoods) -> Vec<L
 }
 
 /// As [`local_planes`], from the `k` nearest neighbours of each point alone.
-pub(crate) fn nearest_planes(points: &[[f32; 3]], neighborhoods: &Neighborhoods, k: usize) -> Vec<LocalPlane> {
+pub(crate) fn nearest_planes(
+    points: &[[f32; 3]],
+    neighborhoods: &Neighborhoods,
+    k: usize,
+) -> Vec<LocalPlane> {
     let mut planes =
         vec![LocalPlane { normal: [0.0; 3], eigenvalues: [0.0; 3] }; points.len().min(neighborhoods.len())];
     planes.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, planes)| {

@@ -125,7 +125,8 @@ impl VoxelGrid {
         let mut sum = self.cells[i];
         let [x, y, z] = unpack(self.keys[i]);
         // Keys are stored one up (see `key_of`), so one below never wraps.
-        for near in [[x - 1, y, z], [x + 1, y, z], [x, y - 1, z], [x, y + 1, z], [x, y, z - 1], [x, y, z + 1]] {
+        for near in [[x - 1, y, z], [x + 1, y, z], [x, y - 1, z], [x, y + 1, z], [x, y, z - 1], [x, y, z + 1]]
+        {
             if let Some(j) = self.table.get(pack(near)) {
                 sum.merge(&self.cells[j as usize]);
             }

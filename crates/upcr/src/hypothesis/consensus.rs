@@ -9,7 +9,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::{Hypothesis, HypothesisSource, Match, Problem};
-use crate::{refine::align, register::Method, transform::Rigid};
+use crate::{refine::align, settings::Method, transform::Rigid};
 
 /// Matches considered, the most distinctive first.
 const MAX_MATCHES: usize = 512;

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::{Hypothesis, HypothesisSource, Match, Problem};
 use crate::{
     refine::{Correspondence, Objective, RobustKernel, align, factor},
-    register::{Method, Refinement},
+    settings::{Method, Refinement},
     transform::Rigid,
 };
 
@@ -61,8 +61,11 @@ fn graduate(mut pose: Rigid, pairs: &[Correspondence], diagonal: f32, tolerance:
     let mut mu = f64::from(diagonal).powi(2).max(floor);
     let mut damping = 0.0;
     loop {
-        let objective =
-            Objective { factor: factor(Refinement::Point, true), kernel: RobustKernel::GemanMcclure, scale_sq: mu };
+        let objective = Objective {
+            factor: factor(Refinement::Point, true),
+            kernel: RobustKernel::GemanMcclure,
+            scale_sq: mu,
+        };
         for _ in 0..STEPS_PER_SCALE {
             match objective.step(&pose, pairs, None, &mut damping) {
                 Some(next) => pose = next,

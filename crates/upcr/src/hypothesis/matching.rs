@@ -90,10 +90,11 @@ impl Best {
 
     /// The better of two, the lower index where they are equal.
     fn or(self, other: Self) -> Self {
-        let (first, last) = match self.distance_sq.total_cmp(&other.distance_sq).then(self.index.cmp(&other.index)) {
-            std::cmp::Ordering::Greater => (other, self),
-            _ => (self, other),
-        };
+        let (first, last) =
+            match self.distance_sq.total_cmp(&other.distance_sq).then(self.index.cmp(&other.index)) {
+                std::cmp::Ordering::Greater => (other, self),
+                _ => (self, other),
+            };
         Self { second_sq: first.second_sq.min(last.distance_sq), ..first }
     }
 }

@@ -8,7 +8,7 @@ mod ransac;
 
 pub(crate) use matching::{Match, match_levels};
 
-use crate::{prepare::Prepared, register::Method, transform::Rigid};
+use crate::{prepare::Prepared, settings::Method, transform::Rigid};
 
 /// A pose to be refined and verified, in local frames.
 #[derive(Debug, Clone, Copy)]

@@ -1,7 +1,7 @@
 //! The pose that the user gave.
 
 use super::{Hypothesis, HypothesisSource, Problem};
-use crate::register::Method;
+use crate::settings::Method;
 
 pub(super) struct Prior;
 

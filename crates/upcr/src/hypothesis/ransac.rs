@@ -5,7 +5,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use super::{Hypothesis, HypothesisSource, Match, Problem};
-use crate::{refine::align, register::Method, transform::Rigid};
+use crate::{refine::align, settings::Method, transform::Rigid};
 
 /// Triples drawn at most.
 const MAX_TRIALS: usize = 200_000;

@@ -7,7 +7,7 @@ use super::{
     Factor, LockedPose, RobustKernel,
     solver::{Correspondence, MIN_DAMPING, Objective},
 };
-use crate::{prepare::Level, transform::Rigid};
+use crate::{prepare::Level, settings::Refinement, transform::Rigid};
 
 /// Source points are matched in blocks of this many; the blocks' results stand in order.
 const BLOCK: usize = 256;
@@ -43,6 +43,8 @@ pub(crate) struct Refined {
     pub hessian: Matrix6<f64>,
     /// Variance of a residual.
     pub variance: f64,
+    /// As `hessian`, of distances along the surfaces' normals alone: what the shape itself holds.
+    pub shape_hessian: Matrix6<f64>,
 }
 
 /// Refines `pose` by moving the points `moved` of `source` onto `target`.
@@ -63,6 +65,7 @@ pub(crate) fn refine(
         converged: false,
         hessian: Matrix6::zeros(),
         variance: 0.0,
+        shape_hessian: Matrix6::zeros(),
     };
     let (first, last) = schedule.max_distance;
     let mut damping = MIN_DAMPING;
@@ -103,6 +106,8 @@ pub(crate) fn refine(
     let objective = Objective { factor, kernel, scale_sq: scale_sq(factor, &pairs, &refined.pose, last) };
     let model = objective.linearize(&refined.pose, &pairs);
     refined.hessian = model.hessian;
+    let along_normals = Objective { factor: super::factor(Refinement::Plane, false), ..objective };
+    refined.shape_hessian = along_normals.linearize(&refined.pose, &pairs).hessian;
     refined.variance = model.residual_sq / model.weight.max(f64::MIN_POSITIVE);
     refined
 }
@@ -111,7 +116,8 @@ pub(crate) fn refine(
 /// search radius allows.
 fn scale_sq(factor: &dyn Factor, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> f64 {
     let plain = Objective { factor, kernel: RobustKernel::None, scale_sq: 1.0 };
-    let mut squares: Vec<f64> = pairs.iter().step_by(pairs.len().div_ceil(SCALE_SAMPLE)).map(|c| plain.squared(pose, c)).collect();
+    let mut squares: Vec<f64> =
+        pairs.iter().step_by(pairs.len().div_ceil(SCALE_SAMPLE)).map(|c| plain.squared(pose, c)).collect();
     let middle = squares.len() / 2;
     let median_sq = *squares.select_nth_unstable_by(middle, f64::total_cmp).1;
     // 1.4826² turns a squared median into a variance; three standard deviations.

@@ -5,7 +5,7 @@
 
 use nalgebra::{DMatrix, Matrix3, Rotation3, Vector3};
 
-use crate::{register::Locks, transform::Rigid};
+use crate::{settings::Locks, transform::Rigid};
 
 /// A local pose whose file-frame counterpart has locked parameters.
 #[derive(Debug, Clone)]

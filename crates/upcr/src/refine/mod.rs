@@ -16,7 +16,7 @@ pub(crate) use lock::LockedPose;
 pub use robust::RobustKernel;
 pub(crate) use solver::{Correspondence, Objective, align};
 
-use crate::register::Refinement;
+use crate::settings::Refinement;
 
 /// Symmetric 3×3 matrix: xx, xy, xz, yy, yz, zz.
 pub(crate) type Symmetric3 = [f64; 6];

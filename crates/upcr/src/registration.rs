@@ -1,0 +1,99 @@
+//! What a registration returns.
+
+use serde::Serialize;
+
+use crate::{
+    settings::{Method, Settings},
+    transform::Rigid,
+};
+
+/// What a caveat is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum Reason {
+    /// The clouds share no surface at the pose found.
+    NoOverlap,
+    /// They share little.
+    LowOverlap,
+    /// Another, different pose explains the clouds nearly as well.
+    Ambiguous,
+    /// Some direction of motion is not held by the geometry (a plane, a cylinder, a corridor).
+    DegenerateAxis,
+    /// Too few points to tell.
+    TooFewPoints,
+    /// The refinement ran out of iterations.
+    NotConverged,
+    /// The surfaces lie near each other, but not as closely as right poses let them.
+    PoorFit,
+}
+
+impl std::fmt::Display for Reason {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::NoOverlap => "the clouds share no surface at the pose found",
+            Self::LowOverlap => "the clouds share little surface at the pose found",
+            Self::Ambiguous => "another, different pose explains the clouds nearly as well",
+            Self::DegenerateAxis => "some direction of motion is not held by the geometry",
+            Self::TooFewPoints => "there are too few points to tell",
+            Self::NotConverged => "the refinement ran out of iterations",
+            Self::PoorFit => "the surfaces lie near each other, but not as closely as a right pose lets them",
+        })
+    }
+}
+
+/// Milliseconds spent in each step; reading files is no part of it.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct Timings {
+    /// Checks, scale, downsampling, normals.
+    pub prepare: f64,
+    /// Features, matching, hypotheses.
+    pub hypotheses: f64,
+    /// Refinement.
+    pub refine: f64,
+    /// Scoring and verdict.
+    pub verify: f64,
+    /// All of it, from call to return.
+    pub total: f64,
+}
+
+/// The one result, whatever the method, always completely filled.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Registration {
+    /// Takes source coordinates to target coordinates, both in their files' own frames: `y = R x + t`.
+    pub T_target_source: Rigid,
+    /// Share of held-out source points with a target point within `voxel_size`, 0 to 1.
+    pub fitness: f64,
+    /// Root mean square distance of those, in the clouds' unit.
+    pub inlier_rmse: f64,
+    /// How many there are.
+    pub num_inliers: usize,
+    /// Whether the refinement settled, with inliers to settle on.
+    pub converged: bool,
+    /// Refinement iterations of the returned pose.
+    pub iterations: usize,
+    /// Probability that the pose is right, 0 to 1.
+    pub probability: f64,
+    /// Covariance of the left twist (rotation rad, translation) of `T_target_source`, about the target's origin.
+    pub covariance: [[f64; 6]; 6],
+    /// What speaks against the pose.
+    pub reasons: Vec<Reason>,
+    /// Which source the winning hypothesis came from.
+    pub method: Method,
+    /// The scale used, in the clouds' unit.
+    pub voxel_size: f64,
+    /// The effective settings.
+    pub settings: Settings,
+    /// Where the time went.
+    pub timings_ms: Timings,
+}
+
+/// Probability from which a pose is called registered.
+pub const TRUSTWORTHY: f64 = 0.5;
+
+impl Registration {
+    /// Whether the pose is more likely right than wrong.
+    pub fn is_trustworthy(&self) -> bool {
+        self.probability >= TRUSTWORTHY
+    }
+}
