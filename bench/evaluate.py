@@ -12,6 +12,7 @@ import platform
 import shlex
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -67,12 +68,66 @@ def call(command: list[str], threads: int, timeout: float) -> tuple[int, dict | 
     return done.returncode, answer, done.stderr.strip(), wall
 
 
-def register(upcr: Path, pair: Pair, threads: int = 2, extra: list[str] = [], repeat: int = 1, timeout: float = 120) -> Run:
-    """Runs the binary on a written pair and judges its answer."""
-    command = [str(upcr), "register", *map(str, pair.files), "--json", "--threads", str(threads), *extra]
+class Warm:
+    """`upcr register --pairs -`, kept running: pairs go in and answers come out one by one.
+
+    Other libraries are timed in a process that is warm too.
+    """
+
+    running: dict[tuple[str, ...], "Warm"] = {}
+
+    def __init__(self, command: tuple[str, ...]):
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def ask(self, columns: list[str], timeout: float) -> tuple[int, dict | None, str, float]:
+        start = time.perf_counter()
+        alarm = threading.Timer(timeout, self.process.kill)
+        alarm.start()
+        try:
+            self.process.stdin.write("\t".join(columns) + "\n")
+            self.process.stdin.flush()
+            line = self.process.stdout.readline()
+        except OSError as error:
+            return FAILED, None, str(error), 0.0
+        finally:
+            alarm.cancel()
+        wall = (time.perf_counter() - start) * 1e3
+        if not line:
+            return FAILED, None, f"no answer within {timeout:g} s, or the process died", wall
+        answer = json.loads(line)
+        if "error" in answer:
+            return FAILED, None, answer["error"], wall
+        return (REGISTERED if answer["probability"] >= SURE else UNTRUSTED), answer, "", wall
+
+    @classmethod
+    def of(cls, command: list[str]) -> "Warm":
+        key = tuple(command)
+        warm = cls.running.get(key)
+        if warm is None or warm.process.poll() is not None:
+            warm = cls.running[key] = cls(key)
+        return warm
+
+
+def ask(upcr: Path, files, threads: int, extra: list[str], timeout: float, cold: bool) -> tuple[int, dict | None, str, float]:
+    """One registration: by the warm process of these options, or by a process of its own."""
+    options = ["--json", "--threads", str(threads)]
+    if cold:
+        return call([str(upcr), "register", *map(str, files), *options, *extra], threads, timeout)
+    columns, rest = list(map(str, files)), list(extra)
+    if "--init" in rest:
+        at = rest.index("--init")
+        columns.append(rest[at + 1])
+        del rest[at : at + 2]
+    return Warm.of([str(upcr), "register", "--pairs", "-", *options, *rest]).ask(columns, timeout)
+
+
+def register(
+    upcr: Path, pair: Pair, threads: int = 2, extra: list[str] = [], repeat: int = 1, timeout: float = 120, cold: bool = False
+) -> Run:
+    """Registers a written pair and judges the answer."""
     answers, walls = [], []
     for _ in range(repeat):
-        status, answer, message, wall = call(command, threads, timeout)
+        status, answer, message, wall = ask(upcr, pair.files, threads, extra, timeout, cold)
         if answer is None:
             return Run(pair.name, status, right=False, wall_ms=wall, message=message)
         answers.append(answer)
@@ -248,6 +303,7 @@ def arguments(description: str, sets: str) -> argparse.ArgumentParser:
     parser.add_argument("--sets", default=sets, help="comma-separated: " + ", ".join([*data.SETS, *data.GROUPS]))
     parser.add_argument("--limit", type=int, help="first pairs of each set only")
     parser.add_argument("--cache", type=Path, default=data.CACHE, help="where the pairs are written")
+    parser.add_argument("--cold", action="store_true", help="start a process for every pair, as a user at a terminal does")
     parser.add_argument("--timeout", type=float, default=120, help="seconds for one registration")
     parser.add_argument("--markdown", action="store_true", help="tables as Markdown")
     parser.add_argument("--verbose", action="store_true", help="one line for each pair, on stderr")
@@ -266,7 +322,7 @@ def main() -> None:
     for name in names:
         for pair in data.pairs(name, options.cache, options.limit):
             extra = shlex.split(options.args)
-            runs[name].append(register(options.upcr, pair, options.threads, extra, options.repeat, options.timeout))
+            runs[name].append(register(options.upcr, pair, options.threads, extra, options.repeat, options.timeout, options.cold))
             if options.verbose:
                 print(line(runs[name][-1]), file=sys.stderr, flush=True)
     if not names:

@@ -230,7 +230,7 @@ def peer_turn(side: Contestant, pair: Pair, turn: Callable[[], tuple[np.ndarray,
 def upcr_turn(side: Contestant, pair: Pair, options, extra: list[str] = []) -> None:
     if not options.upcr:
         return
-    run = evaluate.register(options.upcr, pair, options.threads, extra, options.repeat, options.timeout)
+    run = evaluate.register(options.upcr, pair, options.threads, extra, options.repeat, options.timeout, options.cold)
     side.note(run.right, run.error, run.timings_ms)
     if options.verbose:
         print(evaluate.line(run), file=sys.stderr, flush=True)

@@ -22,6 +22,13 @@ pub fn answer_json(value: &impl Serialize) -> anyhow::Result<()> {
     answer(&text)
 }
 
+/// Prints one JSON object on a line of its own.
+pub fn answer_json_line(value: &impl Serialize) -> anyhow::Result<()> {
+    let mut text = serde_json::to_string(value)?;
+    text.push('\n');
+    answer(&text)
+}
+
 /// Prints a line to stderr; there is nowhere to report a stderr that is gone.
 pub fn note(line: &str) {
     let _ = writeln!(io::stderr(), "{line}");

@@ -1,12 +1,15 @@
 //! `upcr register`: two clouds in, a pose and a verdict out.
 
 use std::fmt::Write;
+use std::fs::File;
+use std::io::{BufRead, BufReader, stdin};
 use std::num::NonZeroUsize;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
+use serde::Serialize;
 use upcr::{Locks, Method, Refinement, Registration, RobustKernel, Settings, io};
 
 use crate::output::{self, Progress};
@@ -16,9 +19,15 @@ use crate::{NOT_REGISTERED, input};
 #[derive(clap::Args)]
 pub struct Args {
     /// The cloud that is moved
-    source: PathBuf,
+    #[arg(required_unless_present = "pairs")]
+    source: Option<PathBuf>,
     /// The cloud that stays
-    target: PathBuf,
+    #[arg(required_unless_present = "pairs")]
+    target: Option<PathBuf>,
+    /// Register many pairs: a file (`-`: stdin) with SOURCE, TARGET and, if any, the first guess's file on each
+    /// line, separated by tabs or blanks. Prints one JSON object a line, in the same order, as soon as it is known
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["source", "target", "init", "output", "transform"])]
+    pairs: Option<PathBuf>,
     /// Where the first pose comes from
     #[arg(long, value_enum, default_value_t = Settings::default().method)]
     method: Method,
@@ -98,14 +107,25 @@ impl Args {
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
+    if let Some(threads) = args.threads {
+        rayon::ThreadPoolBuilder::new().num_threads(threads.get()).build_global()?;
+    }
+    match (&args.pairs, &args.source, &args.target) {
+        (Some(list), ..) => run_pairs(args, list),
+        (None, Some(source), Some(target)) => run_one(args, source, target),
+        _ => bail!("a source and a target are needed"),
+    }
+}
+
+fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<ExitCode> {
     let settings = args.settings()?;
     let mut progress = Progress::new();
     progress.step("reading");
-    let source = args.reading.read(&args.source)?;
-    let target = args.reading.read(&args.target)?;
+    let source = args.reading.read(source_path)?;
+    let target = args.reading.read(target_path)?;
     progress.step("registering");
     let found = upcr::register(&source, &target, &settings)
-        .map_err(|error| input::name_file(error, &args.source, &args.target))?;
+        .map_err(|error| input::name_file(error, source_path, target_path))?;
     progress.step("writing");
     if let Some(path) = &args.transform {
         io::write_transform(path, &found.T_target_source)?;
@@ -122,14 +142,76 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if args.json {
         output::answer_json(&found)?;
     } else {
-        output::answer(&summary(&found, args))?;
+        output::answer(&summary(&found, args, source_path, target_path))?;
     }
     Ok(if trusted { ExitCode::SUCCESS } else { ExitCode::from(NOT_REGISTERED) })
 }
 
-fn summary(found: &Registration, args: &Args) -> String {
+/// One line of the answer to a list of pairs.
+#[derive(Serialize)]
+struct PairAnswer<'a> {
+    source: &'a str,
+    target: &'a str,
+    #[serde(flatten)]
+    found: Option<Registration>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
+}
+
+/// Registers the pairs of a list one after the other; an error is told in its pair's place and ends nothing.
+fn run_pairs(args: &Args, list: &Path) -> Result<ExitCode> {
+    let settings = args.settings()?;
+    let lines: Box<dyn BufRead> = if list.as_os_str() == "-" {
+        Box::new(stdin().lock())
+    } else {
+        Box::new(BufReader::new(File::open(list).with_context(|| list.display().to_string())?))
+    };
+    let (mut failed, mut untrusted) = (false, false);
+    for line in lines.lines() {
+        let line = line.with_context(|| list.display().to_string())?;
+        let columns: Vec<&str> = if line.contains('\t') {
+            line.split('\t').map(str::trim).collect()
+        } else {
+            line.split_whitespace().collect()
+        };
+        let (source, target, init) = match columns[..] {
+            [] => continue,
+            [comment, ..] if comment.starts_with('#') => continue,
+            [source, target] => (source, target, None),
+            [source, target, init] => (source, target, Some(init)),
+            _ => bail!("{}: not two or three columns: {line:?}", list.display()),
+        };
+        let answer = register_pair(args, &settings, source.as_ref(), target.as_ref(), init.map(Path::new));
+        failed |= answer.is_err();
+        untrusted |= answer.as_ref().is_ok_and(|found| !found.is_trustworthy());
+        let (found, error) = match answer {
+            Ok(found) => (Some(found), None),
+            Err(error) => (None, Some(format!("{error:#}"))),
+        };
+        output::answer_json_line(&PairAnswer { source, target, found, error })?;
+    }
+    Ok(match (failed, untrusted) {
+        (true, _) => ExitCode::FAILURE,
+        (false, true) => ExitCode::from(NOT_REGISTERED),
+        (false, false) => ExitCode::SUCCESS,
+    })
+}
+
+fn register_pair(
+    args: &Args,
+    settings: &Settings,
+    source: &Path,
+    target: &Path,
+    init: Option<&Path>,
+) -> Result<Registration> {
+    let settings = Settings { init: init.map(io::read_transform).transpose()?, ..settings.clone() };
+    let (a, b) = (args.reading.read(source)?, args.reading.read(target)?);
+    upcr::register(&a, &b, &settings).map_err(|error| input::name_file(error, source, target))
+}
+
+fn summary(found: &Registration, args: &Args, source: &Path, target: &Path) -> String {
     let pose = &found.T_target_source;
-    let mut text = format!("{} -> {}\n\nT_target_source\n", args.source.display(), args.target.display());
+    let mut text = format!("{} -> {}\n\nT_target_source\n", source.display(), target.display());
     for [a, b, c, t] in pose.to_rows() {
         let _ = writeln!(text, "  {a:>10.6} {b:>10.6} {c:>10.6} {t:>15.6}");
     }

@@ -61,13 +61,13 @@ pub fn register(source: &PointCloud, target: &PointCloud, settings: &Settings) -
         Rigid::from_rows(&init.to_rows()).map_err(|reason| Error::InvalidSetting { name: "init", reason })?;
     }
     match settings.threads {
-        // From inside the pool every parallel step starts without waking a thread first.
-        None => rayon::scope(|_| run(source, target, settings)),
-        Some(threads) => rayon::ThreadPoolBuilder::new()
+        Some(threads) if threads.get() != rayon::current_num_threads() => rayon::ThreadPoolBuilder::new()
             .num_threads(threads.get())
             .build()
             .map_err(|e| Error::InvalidSetting { name: "threads", reason: e.to_string() })?
             .install(|| run(source, target, settings)),
+        // From inside the pool every parallel step starts without waking a thread first.
+        _ => rayon::scope(|_| run(source, target, settings)),
     }
 }
 

@@ -13,7 +13,7 @@ use crate::{refine::align, settings::Method, transform::Rigid};
 
 /// Matches considered, the most distinctive first.
 const MAX_MATCHES: usize = 512;
-/// Seeds looked at, and consensus sets that become poses.
+/// Most distinctive matches that may seed a consensus set, and sets that become poses.
 const SEEDS: usize = 256;
 const CONSENSUSES: usize = 32;
 /// Matches in a seed's first consensus set.
@@ -37,12 +37,11 @@ impl HypothesisSource for Consensus {
     fn propose(&self, problem: &Problem) -> Vec<Hypothesis> {
         let matches = most_distinctive(problem.matches);
         let graph = Compatibility::new(&matches, problem.tolerance);
-        let mut seeds: Vec<(u64, u32)> = (0..matches.len() as u32)
+        let mut seeds: Vec<(u64, u32)> = (0..matches.len().min(SEEDS) as u32)
             .into_par_iter()
             .map(|i| (graph.second_order_degree(i as usize), i))
             .collect();
         seeds.sort_unstable_by_key(|&(degree, i)| (std::cmp::Reverse(degree), i));
-        seeds.truncate(SEEDS);
         // Matches of one consensus lead to one pose: the best of them speaks for the others.
         let mut spoken_for = vec![false; matches.len()];
         let mut consensuses = Vec::new();

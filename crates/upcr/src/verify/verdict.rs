@@ -120,7 +120,7 @@ mod tests {
             (Evidence { runner_up: 0.99, ..GOOD }, Reason::Ambiguous),
             (Evidence { conditioning: 1e-5, ..GOOD }, Reason::DegenerateAxis),
             (Evidence { points: 20, ..GOOD }, Reason::TooFewPoints),
-            (Evidence { sharpness: 0.4, ..GOOD }, Reason::PoorFit),
+            (Evidence { sharpness: 0.3, ..GOOD }, Reason::PoorFit),
         ];
         for (evidence, reason) in cases {
             let verdict = judge(&evidence);
