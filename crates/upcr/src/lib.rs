@@ -11,15 +11,16 @@ mod refine;
 mod register;
 mod registration;
 mod settings;
+mod threads;
 pub mod transform;
 mod verify;
 
 pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
-pub use refine::RobustKernel;
+pub use refine::{Locks, Refinement, RobustKernel};
 pub use register::register;
 pub use registration::{Reason, Registration, TRUSTWORTHY, Timings};
-pub use settings::{Locks, Method, Refinement, Settings};
+pub use settings::{Method, Settings};
 pub use transform::Rigid;
 
 #[cfg(doctest)]

@@ -11,9 +11,10 @@ use crate::{
     features::{Descriptors, Feature, FeatureInput, Fpfh},
     hypothesis::{Hypothesis, Match, Problem, SOURCES, match_levels, separation},
     prepare::{Level, Prepared, check, derive_voxel_size, prepare},
-    refine::{LockedPose, Refined, Schedule, factor, refine},
+    refine::{LockedPose, Refined, Refinement, Schedule, factor, refine},
     registration::{Reason, Registration, Timings},
-    settings::{Method, Refinement, Settings},
+    settings::{Method, Settings},
+    threads::on_threads,
     transform::Rigid,
     verify::{Evidence, covariance, distances, judge, symmetric_score, weakest_direction},
 };
@@ -49,26 +50,8 @@ const DISTINCT_VOXELS: f64 = 6.0;
 /// Where a cloud is too small, degenerate or not finite, or a setting is out of its range. Clouds that cannot
 /// be registered are no error: the result says so (`probability`, `reasons`).
 pub fn register(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
-    if let Some(overlap) = settings.overlap
-        && !(overlap > 0.0 && overlap <= 1.0)
-    {
-        return Err(Error::InvalidSetting {
-            name: "overlap",
-            reason: format!("must be a share above 0 and at most 1, not {overlap}"),
-        });
-    }
-    if let Some(init) = &settings.init {
-        Rigid::from_rows(&init.to_rows()).map_err(|reason| Error::InvalidSetting { name: "init", reason })?;
-    }
-    match settings.threads {
-        Some(threads) if threads.get() != rayon::current_num_threads() => rayon::ThreadPoolBuilder::new()
-            .num_threads(threads.get())
-            .build()
-            .map_err(|e| Error::InvalidSetting { name: "threads", reason: e.to_string() })?
-            .install(|| run(source, target, settings)),
-        // From inside the pool every parallel step starts without waking a thread first.
-        _ => rayon::scope(|_| run(source, target, settings)),
-    }
+    settings.check()?;
+    on_threads(settings.threads, || run(source, target, settings))?
 }
 
 /// A refined pose with its score.
@@ -84,16 +67,7 @@ fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<
     let (source, target) =
         rayon::join(|| check(source, CloudRole::Source), || check(target, CloudRole::Target));
     let (source, target) = (source?, target?);
-    let voxel_size = match settings.voxel_size {
-        Some(v) if v.is_finite() && v > 0.0 => v,
-        Some(v) => {
-            return Err(Error::InvalidSetting {
-                name: "voxel_size",
-                reason: format!("must be a positive length, not {v}"),
-            });
-        }
-        None => derive_voxel_size(&source, &target),
-    };
+    let voxel_size = settings.voxel_size.unwrap_or_else(|| derive_voxel_size(&source, &target));
     let features = settings.method != Method::Prior;
     let (source, target) =
         rayon::join(|| prepare(&source, voxel_size, features), || prepare(&target, voxel_size, features));

@@ -4,7 +4,11 @@ use std::num::NonZeroUsize;
 
 use serde::Serialize;
 
-use crate::{refine::RobustKernel, transform::Rigid};
+use crate::{
+    Error, Result,
+    refine::{Locks, Refinement, RobustKernel},
+    transform::Rigid,
+};
 
 /// Where the first pose comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
@@ -22,54 +26,6 @@ pub enum Method {
     Ransac,
     /// Feature matches that agree with each other (second-order spatial compatibility).
     Consensus,
-}
-
-/// What the refinement minimises.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-#[serde(rename_all = "snake_case")]
-#[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
-pub enum Refinement {
-    /// Generalized ICP (plane to plane).
-    #[default]
-    Gicp,
-    /// Point to plane.
-    Plane,
-    /// Point to point.
-    Point,
-    /// Nothing: the hypothesis is the answer.
-    None,
-}
-
-/// Degrees of freedom of `T_target_source` that keep the value they have in the initial pose.
-///
-/// Roll, pitch and yaw are the extrinsic x, y, z angles of `R = Rz(yaw) Ry(pitch) Rx(roll)`.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
-#[allow(clippy::struct_excessive_bools)]
-pub struct Locks {
-    /// Rotation about x.
-    pub roll: bool,
-    /// Rotation about y.
-    pub pitch: bool,
-    /// Rotation about z.
-    pub yaw: bool,
-    /// Translation along x.
-    pub x: bool,
-    /// Translation along y.
-    pub y: bool,
-    /// Translation along z.
-    pub z: bool,
-}
-
-impl Locks {
-    /// Roll, pitch, yaw, x, y, z.
-    pub fn flags(&self) -> [bool; 6] {
-        [self.roll, self.pitch, self.yaw, self.x, self.y, self.z]
-    }
-
-    /// Whether anything is locked.
-    pub fn any(&self) -> bool {
-        self.flags().contains(&true)
-    }
 }
 
 /// All that a registration can be told. `Settings::default()` is meant to be enough.
@@ -108,5 +64,28 @@ impl Default for Settings {
             seed: 0,
             threads: None,
         }
+    }
+}
+
+impl Settings {
+    /// Refuses what is out of range.
+    pub(crate) fn check(&self) -> Result<()> {
+        let refused = |name, reason| Err(Error::InvalidSetting { name, reason });
+        if let Some(v) = self.voxel_size
+            && !(v.is_finite() && v > 0.0)
+        {
+            return refused("voxel_size", format!("must be a positive length, not {v}"));
+        }
+        if let Some(share) = self.overlap
+            && !(share > 0.0 && share <= 1.0)
+        {
+            return refused("overlap", format!("must be a share above 0 and at most 1, not {share}"));
+        }
+        if let Some(init) = &self.init
+            && let Err(reason) = Rigid::from_rows(&init.to_rows())
+        {
+            return refused("init", reason);
+        }
+        Ok(())
     }
 }

@@ -10,6 +10,7 @@ use crate::PointCloud;
 use crate::cloud::{Support, local_planes, orient_by_curvature, orient_to_viewpoint};
 use crate::error::{CloudRole, Error, Result};
 use crate::neighbors::KdTree;
+use crate::threads::on_threads;
 
 /// Neighbours of a point, itself included, where nothing else is asked for.
 pub const DEFAULT_K: usize = 24;
@@ -42,13 +43,7 @@ pub fn describe(
     threads: Option<NonZeroUsize>,
 ) -> Result<(Descriptors, DescribeTimings)> {
     check(cloud, support)?;
-    let Some(threads) = threads else { return run(cloud, feature, support) };
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads.get()).build();
-    let reason = |error: rayon::ThreadPoolBuildError| Error::InvalidSetting {
-        name: "threads",
-        reason: error.to_string(),
-    };
-    pool.map_err(reason)?.install(|| run(cloud, feature, support))
+    on_threads(threads, || run(cloud, feature, support))?
 }
 
 fn check(cloud: &PointCloud, support: Support) -> Result<()> {

@@ -3,10 +3,10 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Hypothesis, HypothesisSource, Match, Problem};
+use super::{Hypothesis, HypothesisSource, Match, Problem, are_congruent};
 use crate::{
-    refine::{Correspondence, Objective, RobustKernel, align, factor},
-    settings::{Method, Refinement},
+    refine::{Correspondence, Objective, Refinement, RobustKernel, align, factor},
+    settings::Method,
     transform::Rigid,
 };
 
@@ -88,12 +88,7 @@ fn tuples(matches: &[Match], seed: u64) -> Vec<Match> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     for _ in 0..TUPLE_TRIALS_PER_MATCH * matches.len() {
         let triple: [&Match; 3] = std::array::from_fn(|_| &matches[rng.random_range(0..matches.len())]);
-        let congruent = [(0, 1), (1, 2), (2, 0)].iter().all(|&(a, b)| {
-            let (ds, dt) =
-                (distance(triple[a].source, triple[b].source), distance(triple[a].target, triple[b].target));
-            ds > 0.0 && ds.min(dt) > EDGE_RATIO * ds.max(dt)
-        });
-        if congruent {
+        if are_congruent(triple, EDGE_RATIO, 0.0) {
             chosen.extend(triple.map(|m| *m));
             if chosen.len() >= 3 * MAX_TUPLES {
                 break;
@@ -101,8 +96,4 @@ fn tuples(matches: &[Match], seed: u64) -> Vec<Match> {
         }
     }
     chosen
-}
-
-fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
-    a.iter().zip(b).map(|(x, y)| (x - y) * (x - y)).sum::<f32>().sqrt()
 }

@@ -37,6 +37,17 @@ impl Match {
     }
 }
 
+/// Whether three matches span edges of the same length in both clouds, up to the ratio `edge_ratio`, and none
+/// shorter than `shortest`.
+pub(super) fn are_congruent(triple: [&Match; 3], edge_ratio: f32, shortest: f32) -> bool {
+    [(0, 1), (1, 2), (2, 0)].iter().all(|&(a, b)| {
+        let length = |p: [f32; 3], q: [f32; 3]| (Vector3::from(p) - Vector3::from(q)).norm();
+        let source = length(triple[a].source, triple[b].source);
+        let target = length(triple[a].target, triple[b].target);
+        source > shortest && source.min(target) >= edge_ratio * source.max(target)
+    })
+}
+
 /// The match of every distinctive source point.
 pub(crate) fn match_levels(source: (&Level, &Descriptors), target: (&Level, &Descriptors)) -> Vec<Match> {
     let ((from, from_rows), (to, to_rows)) = (distinctive(source.1), distinctive(target.1));

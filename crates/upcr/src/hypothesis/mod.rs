@@ -6,6 +6,7 @@ mod matching;
 mod prior;
 mod ransac;
 
+use matching::are_congruent;
 pub(crate) use matching::{Match, match_levels};
 
 use crate::{prepare::Prepared, settings::Method, transform::Rigid};

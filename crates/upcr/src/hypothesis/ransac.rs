@@ -4,7 +4,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use super::{Hypothesis, HypothesisSource, Match, Problem};
+use super::{Hypothesis, HypothesisSource, Match, Problem, are_congruent};
 use crate::{refine::align, settings::Method, transform::Rigid};
 
 /// Triples drawn at most.
@@ -69,12 +69,8 @@ impl HypothesisSource for Ransac {
 /// Draws three matches; where they are congruent, their pose, re-estimated once over its inliers.
 fn trial(matches: &[Match], tolerance: f32, rng: &mut impl Rng) -> Option<Hypothesis> {
     let triple: [&Match; 3] = std::array::from_fn(|_| &matches[rng.random_range(0..matches.len())]);
-    for (a, b) in [(0, 1), (1, 2), (2, 0)] {
-        let (ds, dt) =
-            (distance(triple[a].source, triple[b].source), distance(triple[a].target, triple[b].target));
-        if ds <= tolerance || ds.min(dt) < EDGE_RATIO * ds.max(dt) {
-            return None;
-        }
+    if !are_congruent(triple, EDGE_RATIO, tolerance) {
+        return None;
     }
     let pose = align(triple.iter().map(|m| (m.source, m.target, 1.0)))?;
     if !triple.iter().all(|m| m.agrees_with(&pose, tolerance)) {
@@ -87,8 +83,4 @@ fn trial(matches: &[Match], tolerance: f32, rng: &mut impl Rng) -> Option<Hypoth
     let second = inliers(&refit).len();
     let (pose, support) = if second >= first.len() { (refit, second) } else { (pose, first.len()) };
     Some(Hypothesis { pose, method: Method::Ransac, support })
-}
-
-fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
-    a.iter().zip(b).map(|(x, y)| (x - y) * (x - y)).sum::<f32>().sqrt()
 }

@@ -7,7 +7,7 @@ use super::{
     Factor, LockedPose, RobustKernel,
     solver::{Correspondence, MIN_DAMPING, Objective},
 };
-use crate::{prepare::Level, settings::Refinement, transform::Rigid};
+use crate::{prepare::Level, refine::Refinement, transform::Rigid};
 
 /// Source points are matched in blocks of this many; the blocks' results stand in order.
 const BLOCK: usize = 256;

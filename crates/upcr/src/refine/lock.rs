@@ -5,7 +5,41 @@
 
 use nalgebra::{DMatrix, Matrix3, Rotation3, Vector3};
 
-use crate::{settings::Locks, transform::Rigid};
+use serde::Serialize;
+
+use crate::transform::Rigid;
+
+/// Degrees of freedom of `T_target_source` that keep the value they have in the initial pose.
+///
+/// Roll, pitch and yaw are the extrinsic x, y, z angles of `R = Rz(yaw) Ry(pitch) Rx(roll)`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[allow(clippy::struct_excessive_bools)]
+pub struct Locks {
+    /// Rotation about x.
+    pub roll: bool,
+    /// Rotation about y.
+    pub pitch: bool,
+    /// Rotation about z.
+    pub yaw: bool,
+    /// Translation along x.
+    pub x: bool,
+    /// Translation along y.
+    pub y: bool,
+    /// Translation along z.
+    pub z: bool,
+}
+
+impl Locks {
+    /// Roll, pitch, yaw, x, y, z.
+    pub fn flags(&self) -> [bool; 6] {
+        [self.roll, self.pitch, self.yaw, self.x, self.y, self.z]
+    }
+
+    /// Whether anything is locked.
+    pub fn any(&self) -> bool {
+        self.flags().contains(&true)
+    }
+}
 
 /// A local pose whose file-frame counterpart has locked parameters.
 #[derive(Debug, Clone)]

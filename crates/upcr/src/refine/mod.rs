@@ -13,10 +13,27 @@ mod solver;
 
 pub(crate) use icp::{Refined, Schedule, refine};
 pub(crate) use lock::LockedPose;
+pub use lock::Locks;
 pub use robust::RobustKernel;
 pub(crate) use solver::{Correspondence, Objective, align};
 
-use crate::settings::Refinement;
+use serde::Serialize;
+
+/// What the refinement minimises.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "snake_case")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
+pub enum Refinement {
+    /// Generalized ICP (plane to plane).
+    #[default]
+    Gicp,
+    /// Point to plane.
+    Plane,
+    /// Point to point.
+    Point,
+    /// Nothing: the hypothesis is the answer.
+    None,
+}
 
 /// Symmetric 3×3 matrix: xx, xy, xz, yy, yz, zz.
 pub(crate) type Symmetric3 = [f64; 6];
