@@ -292,6 +292,11 @@ impl Level {
         }
     }
 
+    /// At most `count` of all point indices.
+    pub fn spread(&self, count: usize) -> Vec<u32> {
+        Self::thin(&(0..self.points.len() as u32).collect::<Vec<_>>(), count)
+    }
+
     /// At most `count` point indices, spread evenly over `indices`.
     pub fn thin(indices: &[u32], count: usize) -> Vec<u32> {
         let step = indices.len().div_ceil(count.max(1)).max(1);

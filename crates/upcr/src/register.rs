@@ -11,12 +11,12 @@ use crate::{
     features::{Descriptors, Feature, FeatureInput, Fpfh},
     hypothesis::{Hypothesis, Match, Problem, SOURCES, match_levels, separation},
     prepare::{Level, Prepared, check, derive_voxel_size, prepare},
-    refine::{LockedPose, Refined, Refinement, Schedule, factor, refine},
+    refine::{Icp, LockedPose, Refined, Refinement, Schedule, factor},
     registration::{Reason, Registration, Timings},
     settings::{Method, Settings},
     threads::on_threads,
     transform::Rigid,
-    verify::{Evidence, covariance, distances, judge, symmetric_score, weakest_direction},
+    verify::{Evidence, covariance, distances, judge, overlap_at, weakest_direction},
 };
 
 /// Probability from which no dearer source of hypotheses is asked.
@@ -33,12 +33,9 @@ const COMPARING_POINTS: usize = 500;
 const SCORING_POINTS: usize = 1500;
 /// Pairs of the final refinement are at most so many voxels apart.
 const REACH_VOXELS: f32 = 2.0;
-/// Iterations of the final refinement at most.
-const MAX_ITERATIONS: usize = 30;
 /// Points that refine a pose until it settles, and in a few last iterations.
 const FEW_POINTS: usize = 1500;
 const FINE_POINTS: usize = 6000;
-const LAST_ITERATIONS: usize = 4;
 /// Scales over which refined poses are compared, each half the one before.
 const SCORING_SCALES: u32 = 4;
 /// Poses closer than this many voxels at the source's rim are one answer.
@@ -166,33 +163,33 @@ impl<'a> Pipeline<'a> {
         Ok(match_levels((a, &da?), (b, &db?)))
     }
 
+    /// The refinement between two levels.
+    fn icp(&self, source: &'a Level, target: &'a Level) -> Icp<'_> {
+        Icp {
+            source,
+            target,
+            factor: factor(self.settings.refine, source.sparse && target.sparse),
+            kernel: self.settings.kernel,
+            lock: self.lock.as_ref(),
+        }
+    }
+
     /// Ranks hypotheses by overlap, refines the best coarsely, ranks again, refines the best of those finely.
     fn refine_hypotheses(&mut self, hypotheses: &[Hypothesis]) {
         let (source, target) = (self.source.coarse(), self.target.coarse());
-        let all =
-            |level: &Level, count| Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), count);
-        let limit = 2.0 * source.voxel_size.max(target.voxel_size);
-        let rank = |pose: &Rigid, points: usize| {
-            let forward = distances(source, &all(source, points), target, pose, limit);
-            let backward = distances(target, &all(target, points), source, &pose.inverse(), limit);
-            symmetric_score(&forward, &backward, limit, 2)
-        };
+        let limit = REACH_VOXELS * source.voxel_size.max(target.voxel_size);
+        let rank = |pose: &Rigid, points: usize| overlap_at(source, target, pose, points, limit).score(2);
         let mut ranked: Vec<(f64, Hypothesis)> =
             hypotheses.par_iter().map(|h| (rank(&h.pose, RANKING_POINTS), *h)).collect();
         keep_promising(&mut ranked, COARSE_CANDIDATES);
-
-        let moved = all(source, COARSE_POINTS);
-        let schedule =
-            Schedule { max_distance: (2.0 * limit, limit), shrink_over: 4, max_iterations: 6, keep: 1.0 };
-        let factor = factor(self.settings.refine, source.sparse && target.sparse);
-        let lock = self.lock.as_ref();
         if self.settings.refine != Refinement::None {
+            let icp = self.icp(source, target);
+            let moved = source.spread(COARSE_POINTS);
             ranked = ranked
                 .par_iter()
                 .map(|(_, h)| {
-                    let kernel = self.settings.kernel;
-                    let refined = refine(source, &moved, target, &h.pose, factor, kernel, &schedule, lock);
-                    (rank(&refined.pose, COMPARING_POINTS), Hypothesis { pose: refined.pose, ..*h })
+                    let pose = icp.refine(&moved, &h.pose, &Schedule::coarse(limit)).pose;
+                    (rank(&pose, COMPARING_POINTS), Hypothesis { pose, ..*h })
                 })
                 .collect();
         }
@@ -205,51 +202,44 @@ impl<'a> Pipeline<'a> {
             }
         }
         keep_promising(&mut distinct, FINE_CANDIDATES);
-        let distinct: Vec<Hypothesis> = distinct.into_iter().map(|(_, h)| h).collect();
-        for h in distinct {
-            let candidate = self.finely_refined(&h);
-            self.candidates.push(candidate);
-        }
+        let refined: Vec<Candidate> = distinct.iter().map(|(_, h)| self.finely_refined(h)).collect();
+        self.candidates.extend(refined);
         self.candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
     }
 
     fn finely_refined(&self, hypothesis: &Hypothesis) -> Candidate {
         let (source, target) = (&self.source.fine, &self.target.fine);
-        let voxel = self.voxel_size as f32;
-        let lock = self.lock.as_ref();
-        let iterations = if self.settings.refine == Refinement::None { 0 } else { MAX_ITERATIONS };
-        let reach = REACH_VOXELS * voxel;
-        let first = if hypothesis.method == Method::Prior { 6.0 } else { 3.0 };
-        let schedule = Schedule {
-            max_distance: (first * voxel, reach),
-            shrink_over: 6,
-            max_iterations: iterations,
-            keep: self.settings.overlap.unwrap_or(1.0),
+        let reach = REACH_VOXELS * self.voxel_size as f32;
+        let icp = self.icp(source, target);
+        let moved = self.source.refined_points();
+        let few = Level::thin(&moved, FEW_POINTS);
+        let keep = self.settings.overlap.unwrap_or(1.0);
+        let refined = if self.settings.refine == Refinement::None {
+            icp.refine(
+                &few,
+                &hypothesis.pose,
+                &Schedule { max_iterations: 0, ..Schedule::settled(reach, keep) },
+            )
+        } else {
+            // A guess may be further off than a pose that matches agree on.
+            let first = if hypothesis.method == Method::Prior { 3.0 * reach } else { 1.5 * reach };
+            let found = icp.refine(&few, &hypothesis.pose, &Schedule::fine(first, reach, keep));
+            if few.len() == moved.len() {
+                found
+            } else {
+                let all = Level::thin(&moved, FINE_POINTS);
+                let settled = icp.refine(&all, &found.pose, &Schedule::settled(reach, keep));
+                Refined {
+                    iterations: found.iterations + settled.iterations,
+                    converged: found.converged || settled.converged,
+                    ..settled
+                }
+            }
         };
-        let factor = factor(self.settings.refine, source.sparse && target.sparse);
-        let kernel = self.settings.kernel;
-        let all_moved = self.source.refined_points();
-        let few = Level::thin(&all_moved, FEW_POINTS);
-        let mut refined = refine(source, &few, target, &hypothesis.pose, factor, kernel, &schedule, lock);
-        if few.len() < all_moved.len() && iterations > 0 {
-            let schedule =
-                Schedule { max_distance: (reach, reach), max_iterations: LAST_ITERATIONS, ..schedule };
-            let moved = Level::thin(&all_moved, FINE_POINTS);
-            let settled = refine(source, &moved, target, &refined.pose, factor, kernel, &schedule, lock);
-            refined = Refined {
-                iterations: refined.iterations + settled.iterations,
-                converged: refined.converged || settled.converged,
-                ..settled
-            };
-        }
-        let all =
-            |level: &Level| Level::thin(&(0..level.points.len() as u32).collect::<Vec<_>>(), SCORING_POINTS);
-        let limit = 2.0 * voxel;
-        let forward = distances(source, &all(source), target, &refined.pose, limit);
-        let backward = distances(target, &all(target), source, &refined.pose.inverse(), limit);
-        let score = symmetric_score(&forward, &backward, limit, SCORING_SCALES);
-        let coarse = symmetric_score(&forward, &backward, limit, 1);
-        Candidate { method: hypothesis.method, refined, score, sharpness: score / coarse.max(1e-9) }
+        let overlap = overlap_at(source, target, &refined.pose, SCORING_POINTS, reach);
+        let score = overlap.score(SCORING_SCALES);
+        let sharpness = score / overlap.score(1).max(f64::MIN_POSITIVE);
+        Candidate { method: hypothesis.method, refined, score, sharpness }
     }
 
     /// The best candidate with the verdict on it.

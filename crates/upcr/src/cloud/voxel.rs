@@ -281,3 +281,46 @@ impl CellTable {
         (found == key).then_some(value)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cell_gives_the_mean_of_what_it_holds() {
+        let cloud = PointCloud {
+            points: vec![[1e6, 0.0, 0.0], [1e6 + 0.5, 0.0, 0.0], [1e6 + 2.5, 0.0, 0.0]],
+            normals: Some(vec![[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+            colors: Some(vec![[10, 0, 0], [20, 0, 0], [90, 80, 70]]),
+            viewpoint: Some([0.0; 3]),
+        };
+        let thin = cloud.voxel_downsample(1.0).unwrap();
+        assert_eq!(thin.points, [[1e6 + 0.25, 0.0, 0.0], [1e6 + 2.5, 0.0, 0.0]]);
+        assert_eq!(thin.colors.unwrap(), [[15, 0, 0], [90, 80, 70]]);
+        let half = 0.5f32.sqrt();
+        let normals = thin.normals.unwrap();
+        assert!(normals[0].iter().zip([0.0, half, half]).all(|(a, b)| (a - b).abs() < 1e-6), "{normals:?}");
+        assert_eq!(normals[1], [1.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn unusable_sizes_are_refused() {
+        let cloud = PointCloud::from_points(vec![[0.0; 3], [1.0; 3]]);
+        for size in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e-9] {
+            assert!(cloud.voxel_downsample(size).is_err(), "{size}");
+        }
+    }
+
+    #[test]
+    fn coarse_cells_are_sums_of_fine_ones() {
+        let points: Vec<[f64; 3]> =
+            (0..5000).map(|i| [(i * 37 % 101) as f64, (i * 53 % 97) as f64, (i * 11 % 89) as f64]).collect();
+        let grid = |size| VoxelGrid::new(points.iter().copied(), [0.0; 3], [0.0; 3], size);
+        let (coarsened, direct) = (grid(4.0).coarsened(), grid(8.0));
+        assert_eq!(coarsened.keys, direct.keys);
+        for (a, b) in coarsened.cells.iter().zip(&direct.cells) {
+            assert_eq!((a.sum, a.outer, a.count), (b.sum, b.outer, b.count));
+        }
+        assert_eq!(direct.cells.len(), count_occupied(&points, [0.0; 3], 8.0));
+    }
+}

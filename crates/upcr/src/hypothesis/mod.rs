@@ -62,3 +62,89 @@ fn drop_repeats(hypotheses: &mut Vec<Hypothesis>, problem: &Problem) {
     }
     *hypotheses = kept;
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Rotation3, Vector3};
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+    use crate::{
+        CloudRole, PointCloud,
+        prepare::{check, prepare},
+    };
+
+    /// 300 matches of which 90 follow one motion and the others none.
+    fn planted(truth: &Rigid) -> Vec<Match> {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut point = || std::array::from_fn(|_| rng.random_range(-1.0..1.0f32));
+        (0..300)
+            .map(|i| {
+                let (source, normal): ([f32; 3], [f32; 3]) = (point(), point());
+                let unit = Vector3::from(normal).normalize();
+                let (target, target_normal) = if i % 10 < 3 {
+                    let moved = truth.apply(source.map(f64::from)).map(|v| v as f32);
+                    (moved, truth.rotation.map(|v| v as f32) * unit)
+                } else {
+                    (point(), Vector3::from(point()).normalize())
+                };
+                Match {
+                    source,
+                    target,
+                    source_normal: unit.into(),
+                    target_normal: target_normal.into(),
+                    ratio: 0.9,
+                    mutual: true,
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn every_source_that_matches_finds_the_motion_that_matches_follow() {
+        let truth = Rigid {
+            rotation: Rotation3::from_euler_angles(0.4, -1.0, 2.5).into_inner(),
+            translation: Vector3::new(0.3, -0.2, 0.5),
+        };
+        let matches = planted(&truth);
+        let corners = (0..8).map(|i| [i & 1, i >> 1 & 1, i >> 2].map(f64::from)).collect();
+        let cloud = PointCloud::from_points(corners);
+        let ready = || prepare(&check(&cloud, CloudRole::Cloud).unwrap(), 0.5, true).unwrap();
+        let (source, target) = (ready(), ready());
+        for finder in SOURCES.iter().filter(|s| s.needs_matches()) {
+            let problem = Problem {
+                source: &source,
+                target: &target,
+                matches: &matches,
+                init: Rigid::identity(),
+                tolerance: 0.05,
+                seed: 1,
+            };
+            let best = finder.propose(&problem)[0];
+            let off = separation(&best.pose, &truth, 1.0);
+            assert!(off < 0.02, "{:?} is {off} off", finder.method());
+            assert!(best.support >= 90, "{:?} has {} matches", finder.method(), best.support);
+            // Nothing depends on anything but the problem.
+            assert_eq!(finder.propose(&problem)[0].pose, best.pose, "{:?}", finder.method());
+        }
+    }
+
+    #[test]
+    fn no_matches_no_hypotheses() {
+        let corners = (0..8).map(|i| [i & 1, i >> 1 & 1, i >> 2].map(f64::from)).collect();
+        let cloud = PointCloud::from_points(corners);
+        let ready = prepare(&check(&cloud, CloudRole::Cloud).unwrap(), 0.5, true).unwrap();
+        for finder in SOURCES.iter().filter(|s| s.needs_matches()) {
+            let problem = Problem {
+                source: &ready,
+                target: &ready,
+                matches: &[],
+                init: Rigid::identity(),
+                tolerance: 0.05,
+                seed: 1,
+            };
+            assert!(finder.propose(&problem).is_empty(), "{:?}", finder.method());
+        }
+    }
+}

@@ -13,6 +13,8 @@ use crate::{prepare::Level, refine::Refinement, transform::Rigid};
 const BLOCK: usize = 256;
 /// Surfaces that face more than this far apart (cosine) are not the same surface.
 const NORMAL_COSINE: f32 = 0.5;
+/// Fewer pairs than a pose has degrees of freedom hold none.
+const FEWEST_PAIRS: usize = 6;
 /// No target point was near.
 const NOTHING: u32 = u32::MAX;
 /// Residuals that tell the kernel's scale.
@@ -33,6 +35,23 @@ pub(crate) struct Schedule {
     pub keep: f64,
 }
 
+impl Schedule {
+    /// A few steps at a coarse level, whose pairs are `reach` apart at most.
+    pub fn coarse(reach: f32) -> Self {
+        Self { max_distance: (2.0 * reach, reach), shrink_over: 4, max_iterations: 6, keep: 1.0 }
+    }
+
+    /// Until the pose settles, from pairs `first` apart to pairs `reach` apart.
+    pub fn fine(first: f32, reach: f32, keep: f64) -> Self {
+        Self { max_distance: (first, reach), shrink_over: 6, max_iterations: 30, keep }
+    }
+
+    /// A few last steps with pairs `reach` apart at most.
+    pub fn settled(reach: f32, keep: f64) -> Self {
+        Self { max_distance: (reach, reach), shrink_over: 1, max_iterations: 4, keep }
+    }
+}
+
 /// A refined pose.
 #[derive(Debug, Clone)]
 pub(crate) struct Refined {
@@ -47,82 +66,131 @@ pub(crate) struct Refined {
     pub shape_hessian: Matrix6<f64>,
 }
 
-/// Refines `pose` by moving the points `moved` of `source` onto `target`.
-#[allow(clippy::too_many_arguments)]
-pub(crate) fn refine(
-    source: &Level,
-    moved: &[u32],
-    target: &Level,
-    pose: &Rigid,
-    factor: &dyn Factor,
-    kernel: RobustKernel,
-    schedule: &Schedule,
-    lock: Option<&LockedPose>,
-) -> Refined {
-    let mut refined = Refined {
-        pose: lock.map_or(*pose, |l| l.project(pose)),
-        iterations: 0,
-        converged: false,
-        hessian: Matrix6::zeros(),
-        variance: 0.0,
-        shape_hessian: Matrix6::zeros(),
-    };
-    let (first, last) = schedule.max_distance;
-    let mut damping = MIN_DAMPING;
-    let mut nearest = vec![NOTHING; moved.len()];
-    for iteration in 0..schedule.max_iterations {
-        let along = (iteration as f32 / schedule.shrink_over.max(1) as f32).min(1.0);
-        let max_distance = first * (last / first).powf(along);
-        let mut pairs = correspondences(source, moved, target, &refined.pose, max_distance, &mut nearest);
+/// Iterative closest points between two clouds.
+pub(crate) struct Icp<'a> {
+    pub source: &'a Level,
+    pub target: &'a Level,
+    pub factor: &'a dyn Factor,
+    pub kernel: RobustKernel,
+    pub lock: Option<&'a LockedPose>,
+}
+
+impl<'a> Icp<'a> {
+    /// Refines `pose` by moving the points `moved` of the source onto the target.
+    pub fn refine(&self, moved: &[u32], pose: &Rigid, schedule: &Schedule) -> Refined {
+        let mut refined = Refined {
+            pose: self.lock.map_or(*pose, |l| l.project(pose)),
+            iterations: 0,
+            converged: false,
+            hessian: Matrix6::zeros(),
+            variance: 0.0,
+            shape_hessian: Matrix6::zeros(),
+        };
+        let (first, last) = schedule.max_distance;
+        let mut damping = MIN_DAMPING;
+        let mut nearest = vec![NOTHING; moved.len()];
+        for iteration in 0..schedule.max_iterations {
+            let along = (iteration as f32 / schedule.shrink_over.max(1) as f32).min(1.0);
+            let max_distance = first * (last / first).powf(along);
+            let mut pairs = self.correspondences(moved, &refined.pose, max_distance, &mut nearest);
+            keep_closest(&mut pairs, &refined.pose, schedule.keep);
+            if pairs.len() < FEWEST_PAIRS {
+                refined.converged = false;
+                return refined;
+            }
+            let objective = self.objective(&pairs, &refined.pose, max_distance);
+            refined.iterations = iteration + 1;
+            let Some(next) = objective.step(&refined.pose, &pairs, self.lock, &mut damping) else {
+                refined.converged = along >= 1.0;
+                if refined.converged {
+                    break;
+                }
+                continue;
+            };
+            let motion = next * refined.pose.inverse();
+            let moved_by = motion.angle() * f64::from(self.target.radius) + motion.translation.norm();
+            refined.pose = next;
+            if along >= 1.0 && moved_by < SETTLED_VOXELS * f64::from(self.source.voxel_size) {
+                refined.converged = true;
+                break;
+            }
+        }
+        let mut pairs = self.correspondences(moved, &refined.pose, last, &mut nearest);
         keep_closest(&mut pairs, &refined.pose, schedule.keep);
-        if pairs.len() < 6 {
+        if pairs.len() < FEWEST_PAIRS {
             refined.converged = false;
             return refined;
         }
-        let objective =
-            Objective { factor, kernel, scale_sq: scale_sq(factor, &pairs, &refined.pose, max_distance) };
-        refined.iterations = iteration + 1;
-        let Some(next) = objective.step(&refined.pose, &pairs, lock, &mut damping) else {
-            refined.converged = along >= 1.0;
-            if refined.converged {
-                break;
-            }
-            continue;
-        };
-        let motion = next * refined.pose.inverse();
-        let moved_by = motion.angle() * f64::from(target.radius) + motion.translation.norm();
-        refined.pose = next;
-        if along >= 1.0 && moved_by < SETTLED_VOXELS * f64::from(source.voxel_size) {
-            refined.converged = true;
-            break;
-        }
+        let objective = self.objective(&pairs, &refined.pose, last);
+        let model = objective.linearize(&refined.pose, &pairs);
+        refined.hessian = model.hessian;
+        let along_normals = Objective { factor: super::factor(Refinement::Plane, false), ..objective };
+        refined.shape_hessian = along_normals.linearize(&refined.pose, &pairs).hessian;
+        refined.variance = model.residual_sq / model.weight.max(f64::MIN_POSITIVE);
+        refined
     }
-    let mut pairs = correspondences(source, moved, target, &refined.pose, last, &mut nearest);
-    keep_closest(&mut pairs, &refined.pose, schedule.keep);
-    if pairs.len() < 6 {
-        refined.converged = false;
-        return refined;
-    }
-    let objective = Objective { factor, kernel, scale_sq: scale_sq(factor, &pairs, &refined.pose, last) };
-    let model = objective.linearize(&refined.pose, &pairs);
-    refined.hessian = model.hessian;
-    let along_normals = Objective { factor: super::factor(Refinement::Plane, false), ..objective };
-    refined.shape_hessian = along_normals.linearize(&refined.pose, &pairs).hessian;
-    refined.variance = model.residual_sq / model.weight.max(f64::MIN_POSITIVE);
-    refined
-}
 
-/// The kernel's scale from the residuals themselves: a few robust standard deviations, within what the
-/// search radius allows.
-fn scale_sq(factor: &dyn Factor, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> f64 {
-    let plain = Objective { factor, kernel: RobustKernel::None, scale_sq: 1.0 };
-    let mut squares: Vec<f64> =
-        pairs.iter().step_by(pairs.len().div_ceil(SCALE_SAMPLE)).map(|c| plain.squared(pose, c)).collect();
-    let middle = squares.len() / 2;
-    let median_sq = *squares.select_nth_unstable_by(middle, f64::total_cmp).1;
-    // 1.4826² turns a squared median into a variance; three standard deviations.
-    let limit = f64::from(max_distance).powi(2);
-    (9.0 * 2.198 * median_sq).clamp(1e-8 * limit, limit)
+    /// What is minimised over `pairs`. The kernel's scale comes from the residuals themselves: a few robust
+    /// standard deviations, within what the search radius allows.
+    fn objective(&self, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> Objective<'a> {
+        let plain = Objective { factor: self.factor, kernel: RobustKernel::None, scale_sq: 1.0 };
+        let mut squares: Vec<f64> = pairs
+            .iter()
+            .step_by(pairs.len().div_ceil(SCALE_SAMPLE))
+            .map(|c| plain.squared(pose, c))
+            .collect();
+        let middle = squares.len() / 2;
+        let median_sq = *squares.select_nth_unstable_by(middle, f64::total_cmp).1;
+        // 1.4826² turns a squared median into a variance; three standard deviations.
+        let limit = f64::from(max_distance).powi(2);
+        let scale_sq = (9.0 * 2.198 * median_sq).clamp(1e-8 * limit, limit);
+        Objective { factor: self.factor, kernel: self.kernel, scale_sq }
+    }
+
+    /// Pairs each point of `moved` with its nearest target point, where one is near and faces the same way.
+    ///
+    /// `nearest` holds the last iteration's answers, from which the search starts, and takes this one's.
+    fn correspondences(
+        &self,
+        moved: &[u32],
+        pose: &Rigid,
+        max_distance: f32,
+        nearest: &mut [u32],
+    ) -> Vec<Correspondence> {
+        let (source, target) = (self.source, self.target);
+        let rotation = pose.rotation.map(|v| v as f32);
+        let translation = pose.translation.map(|v| v as f32);
+        let blocks: Vec<Vec<Correspondence>> = moved
+            .par_chunks(BLOCK)
+            .zip(nearest.par_chunks_mut(BLOCK))
+            .map(|(block, nearest)| {
+                let mut found = Vec::with_capacity(block.len());
+                for (&i, nearest) in block.iter().zip(nearest) {
+                    let p = source.points[i as usize];
+                    let y = rotation * Vector3::from(p) + translation;
+                    let limit_sq = max_distance * max_distance;
+                    let neighbor = match *nearest {
+                        NOTHING => target.tree.nearest(y.into(), limit_sq),
+                        hint => target.tree.nearest_with_hint(y.into(), limit_sq, hint),
+                    };
+                    *nearest = neighbor.map_or(NOTHING, |n| n.index);
+                    let Some(neighbor) = neighbor else { continue };
+                    let (m, n) = (source.normals[i as usize], target.normals[neighbor.index as usize]);
+                    if (rotation * Vector3::from(m)).dot(&Vector3::from(n)).abs() < NORMAL_COSINE {
+                        continue;
+                    }
+                    found.push(Correspondence {
+                        source: p,
+                        target: target.points[neighbor.index as usize],
+                        source_normal: m,
+                        target_normal: n,
+                    });
+                }
+                found
+            })
+            .collect();
+        blocks.concat()
+    }
 }
 
 fn keep_closest(pairs: &mut Vec<Correspondence>, pose: &Rigid, keep: f64) {
@@ -137,49 +205,4 @@ fn keep_closest(pairs: &mut Vec<Correspondence>, pose: &Rigid, keep: f64) {
     };
     pairs.select_nth_unstable_by(kept - 1, |a, b| distance_sq(a).total_cmp(&distance_sq(b)));
     pairs.truncate(kept);
-}
-
-/// Pairs each point of `moved` with its nearest target point, where one is near and faces the same way.
-///
-/// `nearest` holds the last iteration's answers, from which the search starts, and takes this one's.
-fn correspondences(
-    source: &Level,
-    moved: &[u32],
-    target: &Level,
-    pose: &Rigid,
-    max_distance: f32,
-    nearest: &mut [u32],
-) -> Vec<Correspondence> {
-    let rotation = pose.rotation.map(|v| v as f32);
-    let translation = pose.translation.map(|v| v as f32);
-    let blocks: Vec<Vec<Correspondence>> = moved
-        .par_chunks(BLOCK)
-        .zip(nearest.par_chunks_mut(BLOCK))
-        .map(|(block, nearest)| {
-            let mut found = Vec::with_capacity(block.len());
-            for (&i, nearest) in block.iter().zip(nearest) {
-                let p = source.points[i as usize];
-                let y = rotation * Vector3::from(p) + translation;
-                let limit_sq = max_distance * max_distance;
-                let neighbor = match *nearest {
-                    NOTHING => target.tree.nearest(y.into(), limit_sq),
-                    hint => target.tree.nearest_with_hint(y.into(), limit_sq, hint),
-                };
-                *nearest = neighbor.map_or(NOTHING, |n| n.index);
-                let Some(neighbor) = neighbor else { continue };
-                let (m, n) = (source.normals[i as usize], target.normals[neighbor.index as usize]);
-                if (rotation * Vector3::from(m)).dot(&Vector3::from(n)).abs() < NORMAL_COSINE {
-                    continue;
-                }
-                found.push(Correspondence {
-                    source: p,
-                    target: target.points[neighbor.index as usize],
-                    source_normal: m,
-                    target_normal: n,
-                });
-            }
-            found
-        })
-        .collect();
-    blocks.concat()
 }

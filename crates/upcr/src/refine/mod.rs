@@ -11,7 +11,7 @@ mod point;
 mod robust;
 mod solver;
 
-pub(crate) use icp::{Refined, Schedule, refine};
+pub(crate) use icp::{Icp, Refined, Schedule};
 pub(crate) use lock::LockedPose;
 pub use lock::Locks;
 pub use robust::RobustKernel;

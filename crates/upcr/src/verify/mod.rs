@@ -5,5 +5,5 @@ mod overlap;
 mod verdict;
 
 pub(crate) use conditioning::{covariance, weakest_direction};
-pub(crate) use overlap::{distances, symmetric_score};
+pub(crate) use overlap::{distances, overlap_at};
 pub(crate) use verdict::{Evidence, judge};

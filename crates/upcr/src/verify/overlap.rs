@@ -55,14 +55,32 @@ impl Distances {
     }
 }
 
-/// Mean score of both directions over scales from `limit` down: coarse agreement decides first, and between
-/// poses that agree coarsely (a symmetric object's) the fine one does.
-pub(crate) fn symmetric_score(forward: &Distances, backward: &Distances, limit: f32, scales: u32) -> f64 {
-    let total: f64 = (0..scales)
-        .map(|s| {
-            let at = limit / (1u32 << s) as f32;
-            0.5 * (forward.score(at) + backward.score(at))
-        })
-        .sum();
-    total / f64::from(scales)
+/// Distances of points of either cloud to the other, as far as a limit.
+pub(crate) struct Overlap {
+    forward: Distances,
+    backward: Distances,
+    limit: f32,
+}
+
+/// The overlap of two clouds at `pose`, seen by at most `count` points of each.
+pub(crate) fn overlap_at(source: &Level, target: &Level, pose: &Rigid, count: usize, limit: f32) -> Overlap {
+    Overlap {
+        forward: distances(source, &source.spread(count), target, pose, limit),
+        backward: distances(target, &target.spread(count), source, &pose.inverse(), limit),
+        limit,
+    }
+}
+
+impl Overlap {
+    /// Mean score of both directions over `scales` limits, each half the one before: coarse agreement decides
+    /// first, and between poses that agree coarsely (a symmetric object's) the fine one does.
+    pub fn score(&self, scales: u32) -> f64 {
+        let total: f64 = (0..scales)
+            .map(|s| {
+                let at = self.limit / (1u32 << s) as f32;
+                0.5 * (self.forward.score(at) + self.backward.score(at))
+            })
+            .sum();
+        total / f64::from(scales)
+    }
 }
