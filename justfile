@@ -27,14 +27,19 @@ lint:
 docs:
     RUSTDOCFLAGS='-D warnings' cargo doc --no-deps --workspace
 
-# Run the benchmarks
+# Run the benchmarks of neighbours, normals and features
 bench *args:
     cargo bench --workspace {{ args }}
 
-# Measure accuracy on public scans, e.g. `just evaluate --sets bunny`
+# Measure accuracy on public scans, e.g. `just evaluate --sets bunny`; needs bench/requirements.txt
 evaluate *args:
     cargo build --release -p upcr-cli
     python3 bench/evaluate.py {{ args }}
+
+# Measure speed and accuracy beside Open3D and small_gicp; needs bench/requirements.txt
+compare *args:
+    cargo build --release -p upcr-cli
+    python3 bench/peers.py {{ args }}
 
 # All that continuous integration checks
 ci:

@@ -13,7 +13,7 @@ use serde::Serialize;
 use upcr::{Locks, Method, Refinement, Registration, RobustKernel, Settings, io};
 
 use crate::output::{self, Progress};
-use crate::{NOT_REGISTERED, input};
+use crate::{NOT_REGISTERED, describe, input};
 
 /// Find the pose that lays SOURCE on TARGET
 #[derive(clap::Args)]
@@ -186,7 +186,7 @@ fn run_pairs(args: &Args, list: &Path) -> Result<ExitCode> {
         untrusted |= answer.as_ref().is_ok_and(|found| !found.is_trustworthy());
         let (found, error) = match answer {
             Ok(found) => (Some(found), None),
-            Err(error) => (None, Some(format!("{error:#}"))),
+            Err(error) => (None, Some(describe(&error))),
         };
         output::answer_json_line(&PairAnswer { source, target, found, error })?;
     }

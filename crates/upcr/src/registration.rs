@@ -22,7 +22,7 @@ pub enum Reason {
     DegenerateAxis,
     /// Too few points to tell.
     TooFewPoints,
-    /// The refinement ran out of iterations.
+    /// The refinement did not settle: no inliers to settle on, or no iterations left.
     NotConverged,
     /// The surfaces lie near each other, but not as closely as right poses let them.
     PoorFit,
@@ -36,7 +36,7 @@ impl std::fmt::Display for Reason {
             Self::Ambiguous => "another, different pose explains the clouds nearly as well",
             Self::DegenerateAxis => "some direction of motion is not held by the geometry",
             Self::TooFewPoints => "there are too few points to tell",
-            Self::NotConverged => "the refinement ran out of iterations",
+            Self::NotConverged => "the refinement did not settle",
             Self::PoorFit => "the surfaces lie near each other, but not as closely as a right pose lets them",
         })
     }
