@@ -16,7 +16,7 @@ use crate::{
     settings::{Method, Settings},
     threads::on_threads,
     transform::Rigid,
-    verify::{Evidence, covariance, distances, judge, overlap_at, weakest_direction},
+    verify::{Evidence, conditioning, covariance, distances, judge, overlap_at},
 };
 
 /// Probability from which no dearer source of hypotheses is asked.
@@ -239,7 +239,8 @@ impl<'a> Pipeline<'a> {
         let overlap = overlap_at(source, target, &refined.pose, SCORING_POINTS, reach);
         let score = overlap.score(SCORING_SCALES);
         let sharpness = score / overlap.score(1).max(f64::MIN_POSITIVE);
-        Candidate { method: hypothesis.method, refined, score, sharpness }
+        // Walls that slide along each other overlap more than those that stand where they belong, but less closely.
+        Candidate { method: hypothesis.method, refined, score: score * sharpness, sharpness }
     }
 
     /// The best candidate with the verdict on it.
@@ -257,8 +258,7 @@ impl<'a> Pipeline<'a> {
         let limit = self.voxel_size as f32;
         let forward = distances(source, &self.source.held_out_points(), target, pose, limit);
         let backward = distances(target, &self.target.held_out_points(), source, &pose.inverse(), limit);
-        let (weakest, conditioning) = weakest_direction(&best.refined.shape_hessian, radius);
-        let _ = weakest;
+        let conditioning = conditioning(&best.refined.shape_hessian, radius);
         let inliers = forward.within(limit) + backward.within(limit);
         let evidence = Evidence {
             overlap: [forward.share(limit), backward.share(limit)],

@@ -16,15 +16,12 @@ pub(crate) fn covariance(hessian: &Matrix6<f64>, variance: f64, radius: f64) -> 
     scale * (q * Matrix6::from_diagonal(&spread) * q.transpose()) * scale
 }
 
-/// The direction (left twist, rotation in units of 1/radius) that the geometry holds least, and how firmly: the
-/// ratio of the smallest to the largest eigenvalue of the information matrix.
-pub(crate) fn weakest_direction(hessian: &Matrix6<f64>, radius: f64) -> (Vector6<f64>, f64) {
+/// How firmly the geometry holds the direction that it holds least: the ratio of the smallest to the largest
+/// eigenvalue of the information matrix, its rotations in units of 1/radius.
+pub(crate) fn conditioning(hessian: &Matrix6<f64>, radius: f64) -> f64 {
     let scale = rotation_scale(radius);
-    let eigen = SymmetricEigen::new(scale * hessian * scale);
-    let most = eigen.eigenvalues.amax();
-    let (index, &least) =
-        eigen.eigenvalues.iter().enumerate().min_by(|a, b| a.1.total_cmp(b.1)).unwrap_or((0, &0.0));
-    (eigen.eigenvectors.column(index).into(), if most > 0.0 { least.max(0.0) / most } else { 0.0 })
+    let information = (scale * hessian * scale).symmetric_eigenvalues();
+    if information.max() > 0.0 { information.min().max(0.0) / information.max() } else { 0.0 }
 }
 
 /// Turns radians into lengths at the cloud's rim, so that all six entries have one unit.

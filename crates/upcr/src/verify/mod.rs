@@ -4,6 +4,6 @@ mod conditioning;
 mod overlap;
 mod verdict;
 
-pub(crate) use conditioning::{covariance, weakest_direction};
+pub(crate) use conditioning::{conditioning, covariance};
 pub(crate) use overlap::{distances, overlap_at};
 pub(crate) use verdict::{Evidence, judge};
