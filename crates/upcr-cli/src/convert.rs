@@ -16,6 +16,9 @@ pub struct Args {
     input: PathBuf,
     /// The cloud to write
     output: PathBuf,
+    /// Leave out points with NaN or infinite coordinates
+    #[arg(long)]
+    remove_invalid: bool,
     /// Keep one point, the mean, of every cube of this edge, in the cloud's unit
     #[arg(long, value_name = "LENGTH", allow_negative_numbers = true)]
     voxel_size: Option<f64>,
@@ -47,6 +50,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     progress.step("reading");
     let mut points = args.reading.read(&args.input)?;
     let read = points.len();
+    if args.remove_invalid {
+        points = points.finite();
+    }
     if let Some(size) = args.voxel_size {
         progress.step("downsampling");
         points = points

@@ -1,7 +1,9 @@
 //! Where words go: the answer to stdout, everything else to stderr. A reader that hangs up ends nothing.
 
 use std::io::{self, IsTerminal, Write};
+use std::path::Path;
 
+use anyhow::bail;
 use serde::Serialize;
 
 /// Prints the answer. A closed pipe is no error: whoever closed it has read enough.
@@ -27,6 +29,16 @@ pub fn answer_json_line(value: &impl Serialize) -> anyhow::Result<()> {
     let mut text = serde_json::to_string(value)?;
     text.push('\n');
     answer(&text)
+}
+
+/// Refuses an output file whose folder does not exist, before long work and not after it.
+pub fn check_folder(path: &Path) -> anyhow::Result<()> {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() && !folder.is_dir() => {
+            bail!("{}: there is no folder {}", path.display(), folder.display())
+        }
+        _ => Ok(()),
+    }
 }
 
 /// Prints a line to stderr; there is nowhere to report a stderr that is gone.

@@ -119,6 +119,12 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<ExitCode> {
     let settings = args.settings()?;
+    for path in [&args.transform, &args.output].into_iter().flatten() {
+        output::check_folder(path)?;
+    }
+    if let Some(path) = &args.output {
+        io::check_writable(path)?;
+    }
     let mut progress = Progress::new();
     progress.step("reading");
     let source = args.reading.read(source_path)?;

@@ -57,7 +57,7 @@ pub enum Error {
         reason: String,
     },
     /// Fewer points than the task needs.
-    #[error("{role} has {found} points, at least {needed} are needed")]
+    #[error("{role} has too few points: {found}, where {needed} are needed")]
     TooFewPoints {
         /// Which cloud.
         role: CloudRole,
@@ -67,7 +67,7 @@ pub enum Error {
         needed: usize,
     },
     /// Coordinates that are NaN or infinite.
-    #[error("{role} has {count} points with NaN or infinite coordinates, the first at index {first}")]
+    #[error("{role} has NaN or infinite coordinates in {count} of its points, the first at index {first}")]
     NonFinite {
         /// Which cloud.
         role: CloudRole,

@@ -12,7 +12,7 @@ use crate::{
     hypothesis::{Hypothesis, Match, Problem, SOURCES, match_levels, separation},
     prepare::{Level, Prepared, check, derive_voxel_size, prepare},
     refine::{Icp, LockedPose, Refined, Refinement, Schedule, factor},
-    registration::{Reason, Registration, Timings},
+    registration::{Registration, Timings},
     settings::{Method, Settings},
     threads::on_threads,
     transform::Rigid,
@@ -285,9 +285,7 @@ impl<'a> Pipeline<'a> {
             covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
             reasons: verdict.reasons,
             method: best.method,
-            voxel_size: self.voxel_size,
-            settings: Settings { voxel_size: Some(self.voxel_size), ..self.settings.clone() },
-            timings_ms: Timings::default(),
+            ..self.nothing_found()
         }
     }
 
@@ -295,6 +293,7 @@ impl<'a> Pipeline<'a> {
     fn nothing_found(&self) -> Registration {
         let radius = f64::from(self.source.fine.radius);
         let covariance = covariance(&Matrix6::zeros(), 0.0, radius);
+        let points = self.source.fine.points.len().min(self.target.fine.points.len());
         Registration {
             T_target_source: to_file(&self.init, self.source, self.target),
             fitness: 0.0,
@@ -304,7 +303,7 @@ impl<'a> Pipeline<'a> {
             iterations: 0,
             probability: 0.0,
             covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
-            reasons: vec![Reason::NoOverlap],
+            reasons: judge(&Evidence::none(points)).reasons,
             method: self.settings.method,
             voxel_size: self.voxel_size,
             settings: Settings { voxel_size: Some(self.voxel_size), ..self.settings.clone() },

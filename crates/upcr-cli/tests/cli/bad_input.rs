@@ -80,7 +80,7 @@ fn too_few_points() {
     let one = scratch.xyz("one.xyz", &[[1.0, 2.0, 3.0]]);
     as_source(&scratch, &one).assert_fails(1, &["one.xyz", "points"]);
     let run = upcr(["register", &sample("source.ply"), &one]);
-    run.assert_fails(1, &["one.xyz", "target has 1 points"]);
+    run.assert_fails(1, &["one.xyz", "target has too few points: 1"]);
 }
 
 #[test]

@@ -210,3 +210,15 @@ fn help_tells_the_exit_statuses() {
     }
     assert_eq!(upcr(["--version"]).stdout, concat!("upcr ", env!("CARGO_PKG_VERSION"), "\n"));
 }
+
+#[test]
+fn convert_leaves_out_invalid_points_when_told_to() {
+    let scratch = Scratch::new();
+    let cloud = scratch.file("holes.xyz", "1 2 3\nnan 1 1\n4 5 6\n7 8 inf\n");
+    let kept = scratch.path("kept.xyz");
+    let run = upcr(["convert", &cloud, &kept, "--remove-invalid"]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let text = std::fs::read_to_string(&kept).unwrap();
+    let rows = text.lines().filter(|line| line.starts_with(|c: char| c.is_ascii_digit())).count();
+    assert_eq!(rows, 2, "{text}");
+}

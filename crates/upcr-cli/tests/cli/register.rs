@@ -179,3 +179,53 @@ fn a_closed_pipe_is_no_panic() {
     assert_eq!(output.status.code(), Some(0));
     assert_eq!(output.stderr, b"");
 }
+
+#[test]
+fn a_list_of_pairs_is_answered_line_by_line() {
+    let scratch = Scratch::new();
+    let (source, target) = (sample("source.ply"), sample("target.ply"));
+    let missing = scratch.path("nowhere.ply");
+    let truth = sample("T_target_source.txt");
+    let list = scratch.file(
+        "pairs.txt",
+        format!(
+            "# source target guess\n{source}\t{target}\n\n{missing}\t{target}\n{source}\t{target}\t{truth}\n"
+        ),
+    );
+    let run = upcr(["register", "--pairs", &list]);
+    assert_eq!(run.status, 1, "one pair is unreadable: {}", run.stderr);
+    let answers: Vec<Value> = run.stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(answers.len(), 3);
+    for found in [&answers[0], &answers[2]] {
+        assert_eq!(found["source"], source.as_str());
+        let (degrees, _) = pose_error(&matrix(&found["T_target_source"]), &numbers(&truth));
+        assert!(degrees < 1.0, "off by {degrees}°");
+    }
+    let error = answers[1]["error"].as_str().unwrap();
+    assert!(error.contains("nowhere.ply") && answers[1].get("T_target_source").is_none(), "{error}");
+
+    let alone = upcr(["register", &source, &target, "--json"]).json();
+    assert_eq!(answers[0]["T_target_source"], alone["T_target_source"], "alone or in a list: the same bits");
+
+    let garbled = scratch.file("garbled.txt", "one two three four\n");
+    upcr(["register", "--pairs", &garbled]).assert_fails(1, &["garbled.txt", "columns"]);
+    assert_eq!(
+        upcr(["register", &source, "--pairs", &list]).status,
+        2,
+        "a list and a source exclude each other"
+    );
+}
+
+#[test]
+fn outputs_that_cannot_be_written_are_refused_before_the_work() {
+    let scratch = Scratch::new();
+    let (source, target) = (sample("source.ply"), sample("target.ply"));
+    for (option, path, word) in [
+        ("-o", scratch.path("aligned.unknown"), "known format"),
+        ("-o", scratch.path("aligned.off"), "not written"),
+        ("-o", scratch.path("nowhere/aligned.ply"), "no folder"),
+        ("--transform", scratch.path("nowhere/T.txt"), "no folder"),
+    ] {
+        upcr(["register", &source, &target, option, &path]).assert_fails(1, &[word]);
+    }
+}

@@ -53,4 +53,12 @@ impl PointCloud {
         }
         Ok((!self.is_empty()).then_some(Bounds { min, max }))
     }
+
+    /// The cloud without the points that have a NaN or infinite coordinate.
+    #[must_use]
+    pub fn finite(&self) -> Self {
+        let kept: Vec<usize> =
+            (0..self.len()).filter(|&i| self.points[i].iter().all(|v| v.is_finite())).collect();
+        self.select(&kept)
+    }
 }

@@ -169,15 +169,25 @@ pub fn write_cloud(path: impl AsRef<Path>, cloud: &PointCloud) -> Result<()> {
 /// As [`write_cloud`].
 pub fn write_cloud_with(path: impl AsRef<Path>, cloud: &PointCloud, options: &WriteOptions) -> Result<()> {
     let path = path.as_ref();
-    let format = format_of(path)?;
-    let Some(write) = format.write else {
-        return Err(explain(
-            path,
-            format.name,
-            Fault::Unsupported(format!("{} files can be read but not written", format.name)),
-        ));
-    };
+    let (format, write) = writer_of(path)?;
     write_atomically(path, |output| write(output, cloud, options)).map_err(|f| explain(path, format.name, f))
+}
+
+/// Whether `path`'s extension tells a format that can be written: to be asked before long work.
+///
+/// # Errors
+/// [`Error::Unsupported`] where it does not.
+pub fn check_writable(path: impl AsRef<Path>) -> Result<()> {
+    writer_of(path.as_ref()).map(|_| ())
+}
+
+fn writer_of(path: &Path) -> Result<(&'static Format, Writer)> {
+    let format = format_of(path)?;
+    let unwritable = || Fault::Unsupported(format!("{} files can be read but not written", format.name));
+    match format.write {
+        Some(write) => Ok((format, write)),
+        None => Err(explain(path, format.name, unwritable())),
+    }
 }
 
 /// Name of the format that `path`'s extension tells; `None` for an unknown one.

@@ -10,7 +10,7 @@ const FEWEST_POINTS: usize = 50;
 const NO_OVERLAP: f64 = 0.1;
 const LOW_OVERLAP: f64 = 0.3;
 /// A runner-up this close in score is as good an answer.
-const AMBIGUOUS_MARGIN: f64 = 0.03;
+const AMBIGUOUS_MARGIN: f64 = 0.05;
 /// Information, relative to the best held direction, under which a direction is free. Real scans of rooms,
 /// streets and statues have 0.005 and more; planes and cylinders under scanner noise less than 0.001.
 const FREE_DIRECTION: f64 = 0.0015;
@@ -39,6 +39,21 @@ pub(crate) struct Evidence {
     pub points: usize,
 }
 
+impl Evidence {
+    /// Of a pose that nothing speaks for, between clouds of at least `points` points.
+    pub fn none(points: usize) -> Self {
+        Self {
+            overlap: [0.0; 2],
+            inliers: 0,
+            sharpness: 0.0,
+            runner_up: 0.0,
+            conditioning: 0.0,
+            converged: true,
+            points,
+        }
+    }
+}
+
 /// Probability and reasons.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Verdict {
@@ -54,15 +69,18 @@ pub(crate) fn judge(e: &Evidence) -> Verdict {
         reasons.push(Reason::TooFewPoints);
     }
     if overlap < NO_OVERLAP || e.inliers < FEWEST_INLIERS {
+        // Where nothing meets, nothing can be said of the rest.
         reasons.push(Reason::NoOverlap);
-    } else if overlap < LOW_OVERLAP {
-        reasons.push(Reason::LowOverlap);
-    }
-    if 1.0 - e.runner_up < AMBIGUOUS_MARGIN {
-        reasons.push(Reason::Ambiguous);
-    }
-    if e.conditioning < FREE_DIRECTION && e.sharpness < SAME_SAMPLES {
-        reasons.push(Reason::DegenerateAxis);
+    } else {
+        if overlap < LOW_OVERLAP {
+            reasons.push(Reason::LowOverlap);
+        }
+        if 1.0 - e.runner_up < AMBIGUOUS_MARGIN {
+            reasons.push(Reason::Ambiguous);
+        }
+        if e.conditioning < FREE_DIRECTION && e.sharpness < SAME_SAMPLES {
+            reasons.push(Reason::DegenerateAxis);
+        }
     }
     let mut probability = logistic(e);
     if !reasons.is_empty() {
@@ -87,7 +105,7 @@ pub(crate) fn judge(e: &Evidence) -> Verdict {
 fn logistic(e: &Evidence) -> f64 {
     let (larger, smaller) = (e.overlap[0].max(e.overlap[1]), e.overlap[0].min(e.overlap[1]));
     let margin = (1.0 - e.runner_up).min(0.6);
-    let logit = -12.68 - 3.64 * larger + 6.79 * smaller + 20.69 * e.sharpness + 4.19 * margin;
+    let logit = -12.38 - 2.53 * larger + 6.13 * smaller + 18.96 * e.sharpness + 4.79 * margin;
     1.0 / (1.0 + (-logit).exp())
 }
 
