@@ -268,6 +268,7 @@ def compare_refine(name: str, options) -> tuple[Contestant, Contestant]:
 # ---- features
 
 FEATURE_NEIGHBORS = 100
+FEATURE_RUNS = 15  # UPCR starts a process each time: a few milliseconds wait for whatever else the machine does
 FEATURE_VOXELS = {"bunny": 0.0025, "3dmatch": 0.05, "redkitchen": 0.05, "kitti": 0.3}
 
 
@@ -285,6 +286,7 @@ def upcr_features(path: Path, feature: str, k: int, options) -> float:
     if not options.upcr:
         return float("nan")
     command = [str(options.upcr), "features", str(path), "--kind", feature, "-k", str(k), "--json"]
+    time.sleep(0.05)  # the peer's threads spin for some milliseconds after a call, longer than a small cloud takes
     status, answer, message, _ = evaluate.call(command, options.threads, options.timeout)
     try:
         return float(answer["timings_ms"]["neighbors"] + answer["timings_ms"]["feature"])
@@ -294,10 +296,10 @@ def upcr_features(path: Path, feature: str, k: int, options) -> float:
 
 
 def compare_features(names: list[str], options) -> list[dict]:
-    """The same points through both, `repeat` times (at least 3), taking turns."""
+    """The same points through both, `repeat` times (at least FEATURE_RUNS), taking turns."""
     import open3d as o3d
 
-    repeat, rows = max(3, options.repeat), []
+    repeat, rows = max(FEATURE_RUNS, options.repeat), []
 
     def row(name: str, points: np.ndarray, radius: float | None, feature: str, k: int) -> None:
         path = options.cache / "features" / f"{name}.ply"
