@@ -9,6 +9,8 @@ import json
 import os
 import subprocess
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +36,15 @@ def town(count: int, rng: np.random.Generator, x_from: float) -> np.ndarray:
     return np.c_[x, y, z + rng.normal(0, 0.03, count)]
 
 
+def make(file: Path, options, x_from: float, R: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Writes a scan of the town from `x_from` on, and returns its centroid."""
+    points = town(options.points, np.random.default_rng(int(x_from)), x_from) @ R.T + offset
+    np.save(file.with_suffix(".npy"), points)
+    subprocess.run([options.upcr, "convert", file.with_suffix(".npy"), file], check=True, capture_output=True)
+    file.with_suffix(".npy").unlink()
+    return points.mean(axis=0)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--points", type=int, default=10_000_000, help="points a cloud")
@@ -41,19 +52,15 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
 
-    rng = np.random.default_rng(0)
-    R = data.axis_rotation(np.array([0, 0, 1.0]), TURN)
     # A town point p is R p + SOURCE_OFFSET in the source's frame and p + TARGET_OFFSET in the target's.
+    R = data.axis_rotation(np.array([0, 0, 1.0]), TURN)
     truth = data.rigid(R.T, TARGET_OFFSET - R.T @ SOURCE_OFFSET)
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / "source.las", Path(folder) / "target.las"]
-        for file, x_from, turn, offset in zip(files, (0, SHIFT), (R, np.eye(3)), (SOURCE_OFFSET, TARGET_OFFSET)):
-            points = town(options.points, rng, x_from) @ turn.T + offset
-            if file.stem == "source":
-                centroid = points.mean(axis=0)
-            np.save(file.with_suffix(".npy"), points)
-            subprocess.run([options.upcr, "convert", file.with_suffix(".npy"), file], check=True, capture_output=True)
-            file.with_suffix(".npy").unlink()
+        # Made in processes of their own: a process's peak memory counts its parent's.
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as other:
+            centroid = other.submit(make, files[0], options, 0.0, R, SOURCE_OFFSET).result()
+            other.submit(make, files[1], options, SHIFT, np.eye(3), TARGET_OFFSET).result()
         command = [options.upcr, "register", *files, "--json", "--threads", str(options.threads)]
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         answer = json.loads(process.stdout.read())

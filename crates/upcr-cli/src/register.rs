@@ -218,7 +218,9 @@ fn register_pair(
 fn summary(found: &Registration, args: &Args, source: &Path, target: &Path) -> String {
     let pose = &found.T_target_source;
     let mut text = format!("{} -> {}\n\nT_target_source\n", source.display(), target.display());
-    for [a, b, c, t] in pose.to_rows() {
+    for row in pose.to_rows() {
+        // No minus before a zero.
+        let [a, b, c, t] = row.map(|v| if v.abs() < 5e-7 { 0.0 } else { v });
         let _ = writeln!(text, "  {a:>10.6} {b:>10.6} {c:>10.6} {t:>15.6}");
     }
 

@@ -33,6 +33,8 @@ const DENSE_CELL: f64 = 3.0;
 const FEWEST_POINTS: usize = 3;
 /// Every so-many-th point is kept from the refinement and used by the verification alone.
 const HOLD_OUT_EVERY: u32 = 4;
+/// Clouds of fewer points can spare none.
+const HOLD_OUT_FROM: usize = 100;
 
 /// A cloud that passed the checks, with the numbers that later steps need.
 pub(crate) struct Checked<'a> {
@@ -76,12 +78,16 @@ impl Prepared {
 
     /// Indices into `fine` of the points that the refinement moves.
     pub fn refined_points(&self) -> Vec<u32> {
-        (0..self.fine.points.len() as u32).filter(|i| !is_held_out(*i)).collect()
+        let all = 0..self.fine.points.len() as u32;
+        if all.len() < HOLD_OUT_FROM { all.collect() } else { all.filter(|i| !is_held_out(*i)).collect() }
     }
 
     /// Indices into `fine` of the points that only the verification sees.
+    ///
+    /// Of a cloud too small to spare any, all points: they then serve both.
     pub fn held_out_points(&self) -> Vec<u32> {
-        (0..self.fine.points.len() as u32).filter(|i| is_held_out(*i)).collect()
+        let all = 0..self.fine.points.len() as u32;
+        if all.len() < HOLD_OUT_FROM { all.collect() } else { all.filter(|i| is_held_out(*i)).collect() }
     }
 }
 

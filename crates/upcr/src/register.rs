@@ -279,7 +279,7 @@ impl<'a> Pipeline<'a> {
             fitness: forward.share(limit),
             inlier_rmse: forward.rmse(limit),
             num_inliers: forward.within(limit),
-            converged: evidence.converged && inliers >= 3,
+            converged: evidence.converged && forward.within(limit) > 0,
             iterations: best.refined.iterations,
             probability: verdict.probability,
             covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),

@@ -65,10 +65,10 @@ pub(crate) struct Verdict {
 pub(crate) fn judge(e: &Evidence) -> Verdict {
     let overlap = e.overlap[0].max(e.overlap[1]);
     let mut reasons = Vec::new();
-    if e.points < FEWEST_POINTS {
+    if e.points < FEWEST_POINTS || (overlap >= NO_OVERLAP && e.inliers < FEWEST_INLIERS) {
         reasons.push(Reason::TooFewPoints);
     }
-    if overlap < NO_OVERLAP || e.inliers < FEWEST_INLIERS {
+    if overlap < NO_OVERLAP {
         // Where nothing meets, nothing can be said of the rest.
         reasons.push(Reason::NoOverlap);
     } else {
@@ -133,7 +133,7 @@ mod tests {
     fn every_weakness_is_named_and_lowers_the_probability() {
         let cases = [
             (Evidence { overlap: [0.02, 0.03], ..GOOD }, Reason::NoOverlap),
-            (Evidence { inliers: 5, ..GOOD }, Reason::NoOverlap),
+            (Evidence { inliers: 5, ..GOOD }, Reason::TooFewPoints),
             (Evidence { overlap: [0.2, 0.2], ..GOOD }, Reason::LowOverlap),
             (Evidence { runner_up: 0.99, ..GOOD }, Reason::Ambiguous),
             (Evidence { conditioning: 1e-5, ..GOOD }, Reason::DegenerateAxis),
