@@ -20,8 +20,6 @@ const CONSENSUSES: usize = 32;
 const CONSENSUS: usize = 20;
 /// Normals of compatible matches enclose the same angle up to this difference of cosines.
 const COSINE_TOLERANCE: f32 = 0.35;
-/// Hypotheses handed on.
-const MAX_HYPOTHESES: usize = 48;
 
 pub(super) struct Consensus;
 
@@ -67,7 +65,6 @@ impl HypothesisSource for Consensus {
             .collect();
         hypotheses.sort_by_key(|h| std::cmp::Reverse(h.support));
         super::drop_repeats(&mut hypotheses, problem);
-        hypotheses.truncate(MAX_HYPOTHESES);
         hypotheses
     }
 }
