@@ -74,7 +74,8 @@ pub struct Registration {
     pub iterations: usize,
     /// Probability that the pose is right, 0 to 1.
     pub probability: f64,
-    /// Covariance of the left twist (rotation rad, translation) of `T_target_source`, about the target's origin.
+    /// Covariance of the left twist (rotation rad, translation) of the pose, about the centre of the target's
+    /// bounding box.
     pub covariance: [[f64; 6]; 6],
     /// What speaks against the pose.
     pub reasons: Vec<Reason>,
