@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Context, Result, ensure};
 use upcr::io::{self, Encoding};
 
 use crate::input;
@@ -19,9 +19,22 @@ pub struct Args {
     /// Leave out points with NaN or infinite coordinates
     #[arg(long)]
     remove_invalid: bool,
+    /// Leave out statistical outliers: points whose mean distance to their K nearest is more than RATIO standard
+    /// deviations above the average
+    #[arg(long, value_name = "K,RATIO", value_parser = outliers)]
+    remove_outliers: Option<(usize, f64)>,
     /// Keep one point, the mean, of every cube of this edge, in the cloud's unit
     #[arg(long, value_name = "LENGTH", allow_negative_numbers = true)]
     voxel_size: Option<f64>,
+    /// Keep so many points, each the farthest from those kept before
+    #[arg(long, value_name = "N", conflicts_with = "random")]
+    farthest: Option<usize>,
+    /// Keep so many points, drawn at random
+    #[arg(long, value_name = "N")]
+    random: Option<usize>,
+    /// Seed of that drawing
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    seed: u64,
     /// Move the cloud by the pose in this text file (a 4x4 row-major matrix)
     #[arg(long, value_name = "FILE")]
     transform: Option<PathBuf>,
@@ -45,6 +58,13 @@ impl Args {
     }
 }
 
+fn outliers(text: &str) -> Result<(usize, f64)> {
+    let (k, ratio) = text.split_once(',').context("two numbers are needed, as in 20,2")?;
+    let (k, ratio): (usize, f64) = (k.trim().parse()?, ratio.trim().parse()?);
+    ensure!(k > 0 && ratio.is_finite() && ratio >= 0.0, "K must be positive and RATIO not negative");
+    Ok((k, ratio))
+}
+
 pub fn run(args: &Args) -> Result<ExitCode> {
     let mut progress = Progress::new();
     progress.step("reading");
@@ -53,11 +73,21 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     if args.remove_invalid {
         points = points.finite();
     }
+    let named = |error| input::name_file(error, &args.input, &args.input);
+    if let Some((k, ratio)) = args.remove_outliers {
+        progress.step("removing outliers");
+        points = points.without_outliers(k, ratio).map_err(named)?;
+    }
     if let Some(size) = args.voxel_size {
         progress.step("downsampling");
-        points = points
-            .voxel_downsample(size)
-            .map_err(|error| input::name_file(error, &args.input, &args.input))?;
+        points = points.voxel_downsample(size).map_err(named)?;
+    }
+    if let Some(count) = args.farthest {
+        progress.step("sampling");
+        points = points.farthest_sample(count).map_err(named)?;
+    }
+    if let Some(count) = args.random {
+        points = points.random_sample(count, args.seed);
     }
     if let Some(path) = &args.transform {
         points = points.transformed(&io::read_transform(path)?);

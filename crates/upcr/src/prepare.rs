@@ -175,7 +175,7 @@ fn natural_voxel_size(checked: &Checked) -> f64 {
 /// Typical distance between neighbouring samples, as the edge of the square that each would have to itself.
 fn spacing(checked: &Checked) -> f64 {
     const NEIGHBORS: usize = 9;
-    let points = local_points(checked.cloud, checked.bounds.center());
+    let points = checked.cloud.local_points(checked.bounds.center());
     let tree = KdTree::new(&points);
     let step = points.len().div_ceil(SPACING_SAMPLE);
     let mut found = Vec::new();
@@ -197,10 +197,6 @@ fn spacing(checked: &Checked) -> f64 {
     f64::from(*edges.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
-fn local_points(cloud: &PointCloud, origin: [f64; 3]) -> Vec<[f32; 3]> {
-    cloud.points.iter().map(|p| std::array::from_fn(|k| (p[k] - origin[k]) as f32)).collect()
-}
-
 /// Downsamples to `voxel_size` and, where `features` are wanted, to the resolution that carries them.
 pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Result<Prepared> {
     let (cloud, bounds) = (checked.cloud, &checked.bounds);
@@ -220,7 +216,7 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Res
     let mut grid = VoxelGrid::new(cloud.points.iter().copied(), origin, corner, voxel_size);
     if cloud.len() <= FEATURE_POINTS && grid.cells.len() * 10 >= cloud.len() * 4 {
         // The scale is the cloud's own spacing: keep the samples themselves.
-        let points = local_points(cloud, origin);
+        let points = cloud.local_points(origin);
         return Ok(Prepared {
             origin,
             diagonal,

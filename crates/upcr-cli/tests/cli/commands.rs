@@ -222,3 +222,26 @@ fn convert_leaves_out_invalid_points_when_told_to() {
     let rows = text.lines().filter(|line| line.starts_with(|c: char| c.is_ascii_digit())).count();
     assert_eq!(rows, 2, "{text}");
 }
+
+#[test]
+fn convert_samples_and_removes_outliers() {
+    let scratch = Scratch::new();
+    let grid: Vec<[f64; 3]> =
+        (0..400).map(|i| [f64::from(i % 20), f64::from(i / 20), 0.0]).chain([[1e6, 0.0, 500.0]]).collect();
+    let cloud = scratch.xyz("grid.xyz", &grid);
+    let points = |arguments: &[&str]| {
+        let kept = scratch.path("kept.xyz");
+        let run = upcr([&["convert", &cloud, &kept], arguments].concat());
+        assert_eq!(run.status, 0, "{}", run.stderr);
+        let answer = upcr(["info", &kept, "--json"]).json();
+        (answer["points"].as_u64().unwrap(), answer["max"][0].as_f64().unwrap())
+    };
+    assert_eq!(points(&["--remove-outliers", "8,2"]), (400, 19.0));
+    assert_eq!(points(&["--farthest", "5"]), (5, 1e6), "what stands apart is chosen early");
+    assert_eq!(points(&["--random", "50", "--seed", "3"]).0, 50);
+    assert_eq!(points(&["--random", "9999"]).0, 401);
+    for wrong in ["8", "0,1", "8,-1", "8,nan"] {
+        let run = upcr(["convert", &cloud, &scratch.path("none.xyz"), "--remove-outliers", wrong]);
+        assert_eq!(run.status, 2, "{wrong}");
+    }
+}

@@ -58,6 +58,11 @@ impl PointCloud {
         self.points.is_empty()
     }
 
+    /// The points less `origin`: small numbers, which single precision holds well.
+    pub(crate) fn local_points(&self, origin: [f64; 3]) -> Vec<[f32; 3]> {
+        self.points.iter().map(|p| std::array::from_fn(|k| (p[k] - origin[k]) as f32)).collect()
+    }
+
     /// The cloud of the points at `indices`, in that order, with their normals and colours.
     ///
     /// # Panics

@@ -51,15 +51,9 @@ impl PointCloud {
             let role = CloudRole::Cloud;
             return Err(Error::TooFewPoints { role, found: self.len(), needed: MIN_NEIGHBORS });
         }
-        let is_finite = |p: &[f64; 3]| p.iter().all(|v| v.is_finite());
-        if let Some(first) = self.points.iter().position(|p| !is_finite(p)) {
-            let count = self.points.iter().filter(|p| !is_finite(p)).count();
-            return Err(Error::NonFinite { role: CloudRole::Cloud, count, first });
-        }
-        // About the first point, single precision serves georeferenced clouds as well.
+        self.checked_bounds(CloudRole::Cloud)?;
         let origin = self.points[0];
-        let local = |p: [f64; 3]| [0, 1, 2].map(|a| (p[a] - origin[a]) as f32);
-        let points: Vec<_> = self.points.iter().map(|&p| local(p)).collect();
+        let points = self.local_points(origin);
         let tree = KdTree::new(&points);
         let neighborhoods = match support {
             Support::Nearest(k) => tree.knn_graph(k),
@@ -68,7 +62,10 @@ impl PointCloud {
         let mut normals: Vec<_> =
             local_planes(&points, &neighborhoods).iter().map(|plane| plane.normal).collect();
         match viewpoint.or(self.viewpoint) {
-            Some(viewpoint) => orient_to_viewpoint(&points, &mut normals, local(viewpoint)),
+            Some(viewpoint) => {
+                let local = std::array::from_fn(|a| (viewpoint[a] - origin[a]) as f32);
+                orient_to_viewpoint(&points, &mut normals, local);
+            }
             None => orient_by_curvature(&points, &mut normals, &neighborhoods),
         }
         self.normals = Some(normals);

@@ -1,6 +1,6 @@
 //! Points that stand apart.
 
-use crate::neighbors::KdTree;
+use crate::{CloudRole, PointCloud, Result, neighbors::KdTree};
 
 /// Statistical outlier removal (Rusu et al. 2008): indices of the points whose mean distance to their `k`
 /// nearest others is at most `std_ratio` standard deviations above the mean of all points.
@@ -21,6 +21,17 @@ pub fn statistical_inliers(points: &[[f32; 3]], k: usize, std_ratio: f64) -> Vec
     let variance = mean_distances.iter().map(|d| (d - mean).powi(2)).sum::<f64>() / (n - 1.0);
     let limit = mean + std_ratio * variance.sqrt();
     (0..points.len()).filter(|&i| mean_distances[i] <= limit).collect()
+}
+
+impl PointCloud {
+    /// The cloud without its statistical outliers ([`statistical_inliers`]).
+    ///
+    /// # Errors
+    /// [`crate::Error::NonFinite`] where a coordinate is not finite.
+    pub fn without_outliers(&self, k: usize, std_ratio: f64) -> Result<Self> {
+        let Some(bounds) = self.checked_bounds(CloudRole::Cloud)? else { return Ok(self.clone()) };
+        Ok(self.select(&statistical_inliers(&self.local_points(bounds.center()), k, std_ratio)))
+    }
 }
 
 #[cfg(test)]

@@ -4,6 +4,8 @@ use multiversion::multiversion;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::{CloudRole, PointCloud, Result};
+
 /// Points whose distances are kept up to date together.
 const BLOCK: usize = 64;
 
@@ -37,6 +39,23 @@ pub fn random_indices(len: usize, count: usize, seed: u64) -> Vec<usize> {
     indices.truncate(count);
     indices.sort_unstable();
     indices
+}
+
+impl PointCloud {
+    /// `count` points by farthest-point sampling from the first on ([`farthest_points`]), in the order chosen.
+    ///
+    /// # Errors
+    /// [`crate::Error::NonFinite`] where a coordinate is not finite.
+    pub fn farthest_sample(&self, count: usize) -> Result<Self> {
+        let Some(bounds) = self.checked_bounds(CloudRole::Cloud)? else { return Ok(self.clone()) };
+        Ok(self.select(&farthest_points(&self.local_points(bounds.center()), count, 0)))
+    }
+
+    /// `count` points at random ([`random_indices`]), in the cloud's order.
+    #[must_use]
+    pub fn random_sample(&self, count: usize, seed: u64) -> Self {
+        self.select(&random_indices(self.len(), count, seed))
+    }
 }
 
 /// Points and their squared distances to the nearest chosen point.

@@ -58,10 +58,7 @@ fn check(cloud: &PointCloud, support: Support) -> Result<()> {
     if cloud.len() < MIN_POINTS {
         return Err(Error::TooFewPoints { role: CloudRole::Cloud, found: cloud.len(), needed: MIN_POINTS });
     }
-    let mut bad = cloud.points.iter().enumerate().filter(|(_, p)| !p.iter().all(|v| v.is_finite()));
-    if let Some((first, _)) = bad.next() {
-        return Err(Error::NonFinite { role: CloudRole::Cloud, count: 1 + bad.count(), first });
-    }
+    cloud.checked_bounds(CloudRole::Cloud)?;
     Ok(())
 }
 
@@ -80,8 +77,7 @@ fn run(
     };
     // About the first point, single precision serves georeferenced clouds as well.
     let origin = cloud.points[0];
-    let local = |p: [f64; 3]| [0, 1, 2].map(|a| (p[a] - origin[a]) as f32);
-    let points: Vec<_> = cloud.points.iter().map(|&p| local(p)).collect();
+    let points = cloud.local_points(origin);
     let tree = KdTree::new(&points);
     let neighborhoods = match support {
         Support::Nearest(k) => tree.knn_graph(k),
@@ -96,7 +92,10 @@ fn run(
         None => {
             estimated.extend(local_planes(&points, &neighborhoods).iter().map(|plane| plane.normal));
             match cloud.viewpoint {
-                Some(viewpoint) => orient_to_viewpoint(&points, &mut estimated, local(viewpoint)),
+                Some(viewpoint) => {
+                    let local = std::array::from_fn(|a| (viewpoint[a] - origin[a]) as f32);
+                    orient_to_viewpoint(&points, &mut estimated, local);
+                }
                 None => orient_by_curvature(&points, &mut estimated, &neighborhoods),
             }
             &estimated

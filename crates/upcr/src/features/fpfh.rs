@@ -1,14 +1,10 @@
 //! Fast point feature histograms (Rusu et al. 2009).
 
 use multiversion::multiversion;
-use rayon::prelude::*;
 
 use super::spfh::{self, BINS, DIM};
-use super::{Descriptors, Feature, FeatureInput};
+use super::{Descriptors, Feature, FeatureInput, rows};
 use crate::error::Result;
-
-/// Points a parallel task takes.
-const CHUNK: usize = 64;
 
 /// A point's own simplified histogram plus the mean of its neighbours', weighted by 1 / squared distance.
 ///
@@ -32,12 +28,7 @@ impl Feature for Fpfh {
     fn compute(&self, input: &FeatureInput) -> Result<Descriptors> {
         input.check(self)?;
         let simplified = spfh::histograms(input);
-        let mut rows = vec![[0.0; DIM]; simplified.len()];
-        rows.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, rows)| {
-            for (row, i) in rows.iter_mut().zip(chunk * CHUNK..) {
-                *row = weighted(input, &simplified, i);
-            }
-        });
+        let rows = rows(simplified.len(), || (), |(), i| weighted(input, &simplified, i));
         Ok(Descriptors { dim: DIM, values: rows.into_flattened() })
     }
 }

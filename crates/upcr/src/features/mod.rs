@@ -1,5 +1,7 @@
 //! Pose-invariant point features: one file each, one trait.
 
+use rayon::prelude::*;
+
 use crate::error::{Error, Result};
 use crate::neighbors::Neighborhoods;
 
@@ -40,6 +42,24 @@ pub const ALL: &[&dyn Feature] = &[&Distance, &Ppf, &Spfh, &Pfh, &Fpfh];
 /// The feature of that name.
 pub fn by_name(name: &str) -> Option<&'static dyn Feature> {
     ALL.iter().copied().find(|feature| feature.name() == name)
+}
+
+/// A row a point, in parallel; `room` makes what a task reuses from row to row.
+fn rows<const DIM: usize, S>(
+    points: usize,
+    room: impl Fn() -> S + Sync,
+    row: impl Fn(&mut S, usize) -> [f32; DIM] + Sync,
+) -> Vec<[f32; DIM]> {
+    /// Points a parallel task takes.
+    const CHUNK: usize = 64;
+    let mut rows = vec![[0.0; DIM]; points];
+    rows.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, rows)| {
+        let mut room = room();
+        for (out, i) in rows.iter_mut().zip(chunk * CHUNK..) {
+            *out = row(&mut room, i);
+        }
+    });
+    rows
 }
 
 /// What a feature is computed from. `normals` are unit length, one a point.

@@ -1,18 +1,15 @@
 //! Point feature histograms (Rusu et al. 2008).
 
 use multiversion::multiversion;
-use rayon::prelude::*;
 
 use super::pair::{AngleBins, LANES, PairAngles, Points, cosine_bins};
-use super::{Descriptors, Feature, FeatureInput};
+use super::{Descriptors, Feature, FeatureInput, rows};
 use crate::error::Result;
 
 /// Bins of each of the three angles.
 const BINS: usize = 5;
 /// Values a point.
 const DIM: usize = BINS * BINS * BINS;
-/// Points a parallel task takes.
-const CHUNK: usize = 32;
 
 /// The joint histogram of the angles θ, α and φ, 5 bins each, θ varying fastest, over all pairs of points in
 /// the neighbourhood, the point itself among them.
@@ -36,14 +33,8 @@ impl Feature for Pfh {
 
     fn compute(&self, input: &FeatureInput) -> Result<Descriptors> {
         input.check(self)?;
-        let mut rows = vec![[0.0; DIM]; input.points.len()];
         let bins = AngleBins::new();
-        rows.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, rows)| {
-            let mut batches = Vec::new();
-            for (row, i) in rows.iter_mut().zip(chunk * CHUNK..) {
-                *row = histogram(input, i, &bins, &mut batches);
-            }
-        });
+        let rows = rows(input.points.len(), Vec::new, |batches, i| histogram(input, i, &bins, batches));
         Ok(Descriptors { dim: DIM, values: rows.into_flattened() })
     }
 }

@@ -1,10 +1,9 @@
 //! Simplified point feature histograms (Rusu et al. 2009).
 
 use multiversion::multiversion;
-use rayon::prelude::*;
 
 use super::pair::{AngleBins, LANES, PairAngles, Points, cosine_bins};
-use super::{Descriptors, Feature, FeatureInput};
+use super::{Descriptors, Feature, FeatureInput, rows};
 use crate::error::Result;
 use crate::neighbors::Neighbor;
 
@@ -12,8 +11,6 @@ use crate::neighbors::Neighbor;
 pub(super) const BINS: usize = 11;
 /// Values a point.
 pub(super) const DIM: usize = 3 * BINS;
-/// Points a parallel task takes.
-const CHUNK: usize = 64;
 
 /// Histograms, 11 bins each, of the angles θ, α and φ between a point and its neighbours.
 ///
@@ -42,14 +39,8 @@ impl Feature for Spfh {
 
 /// The histograms of every point.
 pub(super) fn histograms(input: &FeatureInput) -> Vec<[f32; DIM]> {
-    let mut rows = vec![[0.0; DIM]; input.points.len()];
     let bins = AngleBins::new();
-    rows.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, rows)| {
-        for (row, i) in rows.iter_mut().zip(chunk * CHUNK..) {
-            *row = histogram(input, i, &bins);
-        }
-    });
-    rows
+    rows(input.points.len(), || (), |(), i| histogram(input, i, &bins))
 }
 
 #[multiversion(targets("x86_64+avx2"))]
