@@ -6,6 +6,7 @@ pub mod features;
 mod hypothesis;
 pub mod io;
 pub mod neighbors;
+pub mod net;
 mod prepare;
 mod refine;
 mod register;
