@@ -37,5 +37,18 @@ impl Feature for Ppf {
 /// The angle between two vectors; accurate at 0 and π as well, unlike the arc cosine.
 fn angle(a: [f32; 3], b: [f32; 3]) -> f32 {
     let sine = cross(a, b);
-    dot(sine, sine).sqrt().atan2(dot(a, b))
+    // Adding zero turns -0, whose angle to +0 is π, into +0.
+    dot(sine, sine).sqrt().atan2(dot(a, b) + 0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::angle;
+
+    #[test]
+    fn the_angle_to_nothing_is_zero_for_every_normal() {
+        for normal in [[1.0, 0.0, 0.0], [-1.0, -0.0, -0.0], [-0.6, -0.8, -0.0]] {
+            assert_eq!(angle(normal, [0.0; 3]), 0.0, "{normal:?}");
+        }
+    }
 }
