@@ -2,4 +2,10 @@
 
 pub mod data;
 pub mod eval;
+#[cfg(feature = "train")]
+pub mod models;
+#[cfg(feature = "train")]
+pub mod ops;
 pub mod random;
+#[cfg(feature = "train")]
+pub mod train;

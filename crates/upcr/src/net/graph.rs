@@ -22,6 +22,30 @@ impl Graph {
         self.neighbors.is_empty()
     }
 
+    /// The `min(k, n)` nearest of every one of n rows of `channels` features, the row itself included; equally near ones
+    /// by index.
+    pub fn of_features(features: &[f32], channels: usize, k: usize) -> Self {
+        let rows = || features.chunks_exact(channels.max(1));
+        let k = k.min(rows().len());
+        let mut neighbors = Vec::with_capacity(k * rows().len());
+        let mut ranked = Vec::new();
+        for own in rows() {
+            ranked.clear();
+            ranked.extend((0_u32..).zip(rows()).map(|(index, other)| {
+                let distance_sq: f32 = own.iter().zip(other).map(|(a, b)| (a - b) * (a - b)).sum();
+                // Non-negative floats order as their bits do.
+                u64::from(distance_sq.to_bits()) << 32 | u64::from(index)
+            }));
+            if k < ranked.len() {
+                ranked.select_nth_unstable(k);
+                ranked.truncate(k);
+            }
+            ranked.sort_unstable();
+            neighbors.extend(ranked.iter().map(|&rank| rank as u32));
+        }
+        Self { k, neighbors }
+    }
+
     /// Neighbours of point `i`, nearest first.
     pub fn row(&self, i: usize) -> &[u32] {
         &self.neighbors[i * self.k..(i + 1) * self.k]

@@ -1,0 +1,17 @@
+//! The project's own differentiable operations.
+//!
+//! Each is a pair of plain functions (values; gradients from what the first kept) over a batch of clouds whose rows
+//! stand one after the other, and enters the framework through its backend extension (`extension`). On other devices
+//! the same operations are written with the framework's own tensors (`generic`).
+
+pub mod batch;
+pub mod canonical_chamfer;
+pub mod edge_embed;
+mod extension;
+mod generic;
+pub mod graph_layer;
+pub mod pool;
+mod product;
+
+pub use batch::BatchGraph;
+pub use extension::{Normalized, NormalizedMap, canonical_chamfer, edge_embed, graph_layer, pool_max};

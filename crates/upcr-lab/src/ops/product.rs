@@ -1,0 +1,59 @@
+//! Matrix products on one thread, over slices with strides.
+
+/// A matrix in a slice: entry (r, c) at `r · row + c · column`.
+#[derive(Clone, Copy)]
+pub(super) struct Matrix<'a> {
+    pub values: &'a [f32],
+    pub row: usize,
+    pub column: usize,
+}
+
+impl<'a> Matrix<'a> {
+    /// Rows of `width` values one after the other.
+    pub fn rows(values: &'a [f32], width: usize) -> Self {
+        Self { values, row: width, column: 1 }
+    }
+
+    pub fn transposed(self) -> Self {
+        Self { row: self.column, column: self.row, ..self }
+    }
+
+    fn holds(&self, rows: usize, columns: usize) -> bool {
+        rows * columns == 0 || (rows - 1) * self.row + (columns - 1) * self.column < self.values.len()
+    }
+}
+
+/// `out = left · right`, or `out += …`, with `out` of `rows` × `columns`, row by row.
+pub(super) fn product(
+    [rows, inner, columns]: [usize; 3],
+    left: Matrix,
+    right: Matrix,
+    out: &mut [f32],
+    accumulate: bool,
+) {
+    assert!(left.holds(rows, inner) && right.holds(inner, columns) && out.len() >= rows * columns);
+    // SAFETY: all entries lie in their slices, as asserted, and `out` is borrowed alone.
+    unsafe {
+        gemm::gemm(
+            rows,
+            columns,
+            inner,
+            out.as_mut_ptr(),
+            1,
+            columns as isize,
+            accumulate,
+            left.values.as_ptr(),
+            left.column as isize,
+            left.row as isize,
+            right.values.as_ptr(),
+            right.column as isize,
+            right.row as isize,
+            if accumulate { 1.0 } else { 0.0 },
+            1.0_f32,
+            false,
+            false,
+            false,
+            gemm::Parallelism::None,
+        );
+    }
+}
