@@ -7,6 +7,7 @@ mod input;
 mod output;
 mod register;
 mod synth;
+mod train;
 
 use std::process::ExitCode;
 
@@ -47,6 +48,7 @@ enum Command {
     Synth(synth::Args),
     Convert(convert::Args),
     Info(info::Args),
+    Train(train::Args),
 }
 
 fn main() -> ExitCode {
@@ -56,6 +58,7 @@ fn main() -> ExitCode {
         Command::Synth(args) => synth::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Info(args) => info::run(&args),
+        Command::Train(args) => train::run(&args),
     };
     outcome.unwrap_or_else(|error| {
         output::note(&format!("error: {}", describe(&error)));

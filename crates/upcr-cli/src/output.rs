@@ -41,6 +41,15 @@ pub fn check_folder(path: &Path) -> anyhow::Result<()> {
     }
 }
 
+/// Runs `work` on so many threads; on all there are where none are told.
+pub fn on_threads<T: Send>(
+    threads: Option<std::num::NonZeroUsize>,
+    work: impl FnOnce() -> T + Send,
+) -> anyhow::Result<T> {
+    let Some(threads) = threads else { return Ok(work()) };
+    Ok(rayon::ThreadPoolBuilder::new().num_threads(threads.get()).build()?.install(work))
+}
+
 /// Prints a line to stderr; there is nowhere to report a stderr that is gone.
 pub fn note(line: &str) {
     let _ = writeln!(io::stderr(), "{line}");

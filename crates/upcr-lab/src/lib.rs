@@ -9,3 +9,6 @@ pub mod ops;
 pub mod random;
 #[cfg(feature = "train")]
 pub mod train;
+
+#[cfg(feature = "train")]
+pub use burn::tensor::Device;

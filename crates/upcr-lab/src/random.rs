@@ -32,6 +32,13 @@ pub fn rotation(rng: &mut impl Rng) -> Matrix3<f64> {
     UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix().into_inner()
 }
 
+/// A seed from a text: its 64-bit Fowler–Noll–Vo hash (1a), which unlike the standard library's never changes.
+pub fn fnv1a(text: &str) -> u64 {
+    text.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -51,6 +58,12 @@ mod tests {
         let traces: Vec<f64> = (0..n).map(|_| rotation(&mut rng).trace()).collect();
         assert!((traces.iter().sum::<f64>() / n as f64).abs() < 0.03);
         assert!((traces.iter().map(|t| t * t).sum::<f64>() / n as f64 - 1.0).abs() < 0.05);
+    }
+
+    #[test]
+    fn hashes_are_those_published() {
+        assert_eq!(fnv1a(""), 0xcbf2_9ce4_8422_2325);
+        assert_eq!(fnv1a("a"), 0xaf63_dc4c_8601_ec8c);
     }
 
     #[test]

@@ -22,14 +22,14 @@ impl<'a, R: Rng> Init<'a, R> {
     fn parameter<const D: usize>(&mut self, values: Vec<f32>, shape: [usize; D]) -> Param<Tensor<D>> {
         self.next_id += 1;
         let tensor = Tensor::from_data(TensorData::new(values, shape), self.device);
-        Param::initialized(ParamId::from(self.next_id), tensor.require_grad())
+        let tensor = if self.device.is_autodiff() { tensor.require_grad() } else { tensor };
+        Param::initialized(ParamId::from(self.next_id), tensor)
     }
 
     /// Values that no gradient changes.
     fn constant<const D: usize>(&mut self, value: f32, shape: [usize; D]) -> Param<Tensor<D>> {
         self.next_id += 1;
-        let tensor = Tensor::full(shape, value, self.device);
-        Param::initialized(ParamId::from(self.next_id), tensor).set_require_grad(false)
+        Param::initialized(ParamId::from(self.next_id), Tensor::full(shape, value, self.device))
     }
 
     /// Uniform in ±√(1/inputs), as PyTorch draws the weights of linear maps.
@@ -82,20 +82,17 @@ impl NormalizedLayer {
 
     /// Mean and variance to normalise with once learned.
     pub fn running(&self) -> [Tensor<1>; 2] {
-        [self.mean.val().inner(), self.var.val().inner()]
+        [self.mean.val(), self.var.val()]
     }
 
     /// Moves the running statistics by `share` towards a batch's.
     #[must_use]
     pub fn observed(mut self, batch: &[Tensor<1>; 2], share: f64) -> Self {
         let [mean, variance] = batch;
-        let towards = |running: Tensor<1>, batch: &Tensor<1>| {
-            let device = running.device();
-            let moved = running.inner() * (1.0 - share) + batch.clone().inner() * share;
-            Tensor::from_data(moved.into_data(), &device)
-        };
-        self.mean = self.mean.map(|running| towards(running, mean)).set_require_grad(false);
-        self.var = self.var.map(|running| towards(running, variance)).set_require_grad(false);
+        let towards =
+            |running: Tensor<1>, batch: &Tensor<1>| (running * (1.0 - share) + batch.clone() * share).detach();
+        self.mean = self.mean.map(|running| towards(running, mean));
+        self.var = self.var.map(|running| towards(running, variance));
         self
     }
 }

@@ -172,8 +172,8 @@ fn replace<const D: usize>(
         .to_f32()
         .filter(|values| stored.shape == shape && values.iter().all(|v| v.is_finite()))
         .ok_or_else(|| malformed(path, format!("{name} must be finite single-precision values of shape {shape:?}")))?;
-    let learns = parameter.is_require_grad();
     let tensor = Tensor::from_data(TensorData::new(values, shape), &old.device());
-    *parameter = Param::initialized(parameter.id, tensor).set_require_grad(learns);
+    let tensor = if old.is_require_grad() { tensor.require_grad() } else { tensor };
+    *parameter = Param::initialized(parameter.id, tensor);
     Ok(())
 }

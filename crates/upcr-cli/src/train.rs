@@ -1,0 +1,277 @@
+//! `upcr train`: a network learned without labels.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use clap::ValueEnum;
+use serde::{Deserialize, Serialize};
+use upcr_lab::data::pairs::Protocol;
+use upcr_lab::data::{self, Half, Shapes, Split};
+use upcr_lab::train::{
+    Event, Mixture, Trainer, TrainingConfig, Watcher, write_atomically,
+};
+
+use crate::output;
+
+const AFTER_HELP: &str = "\
+Files in the run's folder:
+  run.toml                 data, protocol, settings, seed and version
+  checkpoint.safetensors   what --resume needs; written every minute, whole or not at all
+  weights.safetensors      the learned weights, at the end
+  history.csv              the learning curve
+  history.svg              the same as a plot";
+
+/// Learn a network from shapes, without labels
+#[derive(clap::Args)]
+#[command(after_help = AFTER_HELP)]
+pub struct Args {
+    /// Data set to learn from (its training split); may be given several times
+    #[arg(long, value_name = "PATH", required_unless_present = "resume")]
+    data: Vec<PathBuf>,
+    /// Pairs that are made of the shapes
+    #[arg(long, value_enum, default_value_t = Pairs::Upc)]
+    protocol: Pairs,
+    /// Keep three quarters of each cloud
+    #[arg(long)]
+    partial: bool,
+    /// Settings to start from
+    #[arg(long, value_enum, default_value_t = Preset::Quick)]
+    preset: Preset,
+    /// Settings as TOML, instead of a preset
+    #[arg(long, value_name = "FILE", conflicts_with = "preset")]
+    config: Option<PathBuf>,
+    /// Seed of the first weights and of all pairs [default: the settings']
+    #[arg(long)]
+    seed: Option<u64>,
+    /// Threads to use [default: all]; the result does not depend on it
+    #[arg(long, value_name = "N")]
+    threads: Option<std::num::NonZeroUsize>,
+    /// What computes
+    #[arg(long, value_enum, default_value_t = Backend::Cpu)]
+    backend: Backend,
+    /// Folder for the run; made where missing
+    #[arg(long, value_name = "DIR", required_unless_present = "resume")]
+    out: Option<PathBuf>,
+    /// Go on with the run in this folder, as it was started
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["data", "protocol", "partial", "preset", "config", "seed", "out"])]
+    resume: Option<PathBuf>,
+}
+
+/// Pairs that are made of shapes (docs: the evaluation's settings have the same names).
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Pairs {
+    /// Unseen point clouds: the training split
+    Upc,
+    /// Unseen categories: the first half of the categories
+    Uc,
+    /// Noisy data: the training split, noise on every point
+    Nd,
+    /// All kinds at once: clean and noisy, whole and partial
+    Mixed,
+}
+
+#[derive(Clone, Copy, ValueEnum)]
+enum Preset {
+    /// The paper's: 500 epochs of 1,024 points
+    Paper,
+    /// Narrower and with fewer points at first: under an hour on two cores
+    Quick,
+}
+
+/// What computes.
+#[derive(Clone, Copy, ValueEnum)]
+pub enum Backend {
+    /// The processor
+    Cpu,
+    /// An NVIDIA GPU
+    #[cfg(feature = "cuda")]
+    Cuda,
+}
+
+impl Backend {
+    pub fn device(self) -> upcr_lab::Device {
+        match self {
+            Self::Cpu => upcr_lab::Device::flex(),
+            #[cfg(feature = "cuda")]
+            Self::Cuda => upcr_lab::Device::cuda(0),
+        }
+    }
+}
+
+impl Pairs {
+    pub fn mixture(self, partial: bool) -> Mixture {
+        let whole = Protocol::CONSISTENT;
+        let [shared, own] = [Protocol::PARTIAL_SHARED, Protocol::PARTIAL_INDEPENDENT];
+        match (self, partial) {
+            (Self::Upc | Self::Uc, false) => vec![(whole, 1.0)],
+            (Self::Upc | Self::Uc, true) => vec![(shared, 1.0), (own, 1.0)],
+            (Self::Nd, false) => vec![(whole.noisy(), 1.0)],
+            (Self::Nd, true) => vec![(shared.noisy(), 1.0), (own.noisy(), 1.0)],
+            (Self::Mixed, _) => vec![
+                (whole, 4.0),
+                (whole.noisy(), 2.0),
+                (shared, 1.0),
+                (own, 1.0),
+                (shared.noisy(), 1.0),
+                (own.noisy(), 1.0),
+            ],
+        }
+    }
+
+    pub fn shapes(self, path: &Path, split: Split) -> Result<Shapes> {
+        let shapes = match (self, split) {
+            (Self::Uc, Split::Train) => data::open(path, Split::All)?.categories(Half::First),
+            (Self::Uc, _) => data::open(path, Split::All)?.categories(Half::Second),
+            _ => data::open(path, split)?,
+        };
+        Ok(shapes)
+    }
+}
+
+/// What a run was started with: `run.toml`.
+#[derive(Serialize, Deserialize)]
+struct Run {
+    version: String,
+    data: Vec<PathBuf>,
+    protocol: Pairs,
+    partial: bool,
+    training: TrainingConfig,
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    output::on_threads(args.threads, || train(args))?
+}
+
+fn train(args: &Args) -> Result<ExitCode> {
+    let device = args.backend.device();
+    let (folder, run, mut trainer) = match &args.resume {
+        Some(folder) => {
+            let path = folder.join("run.toml");
+            let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+            let run: Run = toml::from_str(&text).with_context(|| path.display().to_string())?;
+            let trainer = if folder.join("checkpoint.safetensors").exists() {
+                Trainer::resume(folder, &device)?
+            } else {
+                Trainer::new(run.training.clone(), folder, &device)?
+            };
+            (folder.clone(), run, trainer)
+        }
+        None => start(args, &device)?,
+    };
+    let mut shapes = Shapes::default();
+    for path in &run.data {
+        shapes.append(run.protocol.shapes(path, Split::Train)?);
+    }
+    output::note(&format!("{} shapes to learn from", shapes.len()));
+    let mixture = run.protocol.mixture(run.partial);
+    let done = trainer.run(&shapes, &mixture, &mut Teller::new()?)?;
+    write_history(&folder, &trainer)?;
+    if !done {
+        output::note(&format!("stopped; go on with: upcr train --resume {}", folder.display()));
+        return Ok(ExitCode::SUCCESS);
+    }
+    let weights = folder.join("weights.safetensors");
+    write_atomically(&weights, &trainer.weights().to_bytes()?)?;
+    output::answer(&format!("{}\n", weights.display()))?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn start(args: &Args, device: &upcr_lab::Device) -> Result<(PathBuf, Run, Trainer)> {
+    let folder = args.out.clone().context("--out is missing")?;
+    let mut training = match (&args.config, args.preset) {
+        (Some(path), _) => {
+            let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+            TrainingConfig::from_toml(&text).with_context(|| path.display().to_string())?
+        }
+        (None, Preset::Paper) => TrainingConfig::default(),
+        (None, Preset::Quick) => TrainingConfig::quick(),
+    };
+    training.seed = args.seed.unwrap_or(training.seed);
+    if folder.join("checkpoint.safetensors").exists() {
+        bail!("{0} holds a run already; go on with it by --resume {0}", folder.display());
+    }
+    std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
+    let trainer = Trainer::new(training.clone(), &folder, device)?;
+    let run = Run {
+        version: env!("CARGO_PKG_VERSION").into(),
+        data: args.data.clone(),
+        protocol: args.protocol,
+        partial: args.partial,
+        training,
+    };
+    write_atomically(&folder.join("run.toml"), toml::to_string_pretty(&run)?.as_bytes())?;
+    Ok((folder, run, trainer))
+}
+
+/// The learning curve as a table and as a plot.
+pub fn write_history(folder: &Path, trainer: &Trainer) -> Result<()> {
+    let mut csv =
+        String::from("step,points,seconds,learning_rate,clouds_per_second,loss,val_loss,val_mae_r_deg,val_mae_t,val_recall\n");
+    for e in trainer.history() {
+        let numbers = e.validation.map_or([f64::NAN; 4], |v| [v.loss, v.mae_r_deg, v.mae_t, v.recall]);
+        let numbers: Vec<String> = numbers.iter().map(f64::to_string).collect();
+        csv.push_str(&format!(
+            "{},{},{:.1},{:e},{:.1},{},{}\n",
+            e.step, e.points, e.seconds, e.learning_rate, e.clouds_per_second, e.loss, numbers.join(",")
+        ));
+    }
+    write_atomically(&folder.join("history.csv"), csv.as_bytes())?;
+    Ok(())
+}
+
+/// Tells of the run's progress on stderr, and of the user's wish to stop.
+pub struct Teller {
+    stopped: Arc<AtomicBool>,
+}
+
+impl Teller {
+    pub fn new() -> Result<Self> {
+        let stopped = Arc::new(AtomicBool::new(false));
+        let flag = stopped.clone();
+        // A second interruption ends the process at once.
+        ctrlc::set_handler(move || {
+            if flag.swap(true, Ordering::SeqCst) {
+                std::process::exit(130);
+            }
+        })?;
+        Ok(Self { stopped })
+    }
+}
+
+impl Watcher for Teller {
+    fn event(&mut self, e: &Event, clouds_left: u64) {
+        let validation = e.validation.map_or(String::new(), |v| {
+            format!(
+                "  held out: loss {:.5}, MAE(R) {:.2}°, MAE(t) {:.4}, recall {:.1} %",
+                v.loss,
+                v.mae_r_deg,
+                v.mae_t,
+                100.0 * v.recall
+            )
+        });
+        output::note(&format!(
+            "step {}/{} ({} points)  loss {:.5}  {:.0} clouds/s  {} left{validation}",
+            e.step,
+            e.steps,
+            e.points,
+            e.loss,
+            e.clouds_per_second,
+            duration(e.time_left(clouds_left)),
+        ));
+    }
+
+    fn stop(&mut self) -> bool {
+        self.stopped.load(Ordering::SeqCst)
+    }
+}
+
+/// Hours and minutes, or minutes and seconds.
+fn duration(d: Duration) -> String {
+    let s = d.as_secs();
+    if s >= 3600 { format!("{}h{:02}m", s / 3600, s / 60 % 60) } else { format!("{}m{:02}s", s / 60, s % 60) }
+}

@@ -1,0 +1,81 @@
+//! What a run needs to go on as if it had never stopped: one file, written atomically.
+
+use std::fs::{self, File};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use burn::optim::ModuleOptimizer;
+use burn::tensor::{Bytes, Device};
+use safetensors::tensor::Dtype;
+use serde::{Deserialize, Serialize};
+use upcr::{Error, Result};
+
+use super::config::TrainingConfig;
+use super::history::History;
+use crate::models::Upcr;
+use crate::models::weights::{StoredTensor, TensorFile, restore, store};
+
+const OPTIMIZER: &str = "optimizer";
+const STATE_KEY: &str = "upcr.training";
+
+/// Where a run is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct State {
+    pub config: TrainingConfig,
+    /// Steps done.
+    pub step: u64,
+    /// Seconds spent.
+    pub seconds: f64,
+    pub history: History,
+}
+
+pub(super) fn save(
+    path: &Path,
+    state: &State,
+    network: &Upcr,
+    optimizer: &ModuleOptimizer,
+) -> Result<()> {
+    let failed = |reason: String| Error::InvalidSetting { name: "checkpoint", reason };
+    let mut file = store(network);
+    let bytes = optimizer.into_bytes().map_err(|e| failed(e.to_string()))?.to_vec();
+    let stored = StoredTensor { dtype: Dtype::U8, shape: vec![bytes.len()], bytes };
+    file.tensors.insert(OPTIMIZER.into(), stored);
+    let state = serde_json::to_string(state).map_err(|e| failed(e.to_string()))?;
+    file.metadata.insert(STATE_KEY.into(), state);
+    write_atomically(path, &file.to_bytes()?)
+}
+
+pub(super) fn load(
+    path: &Path,
+    optimizer: ModuleOptimizer,
+    device: &Device,
+) -> Result<(State, Upcr, ModuleOptimizer)> {
+    let malformed = |reason: String| Error::Malformed { path: path.into(), format: "checkpoint", reason };
+    let bytes = fs::read(path).map_err(|source| Error::Io { path: path.into(), source })?;
+    let file = TensorFile::from_bytes(&bytes, path)?;
+    let state = file.metadata.get(STATE_KEY).ok_or_else(|| malformed(format!("has no {STATE_KEY}")))?;
+    let state = serde_json::from_str(state).map_err(|e| malformed(format!("{STATE_KEY}: {e}")))?;
+    let network = restore(&file, path, device)?;
+    let stored = file.tensors.get(OPTIMIZER).ok_or_else(|| malformed(format!("has no {OPTIMIZER}")))?;
+    let optimizer = optimizer
+        .from_bytes(Bytes::from_bytes_vec(stored.bytes.clone()))
+        .map_err(|e| malformed(format!("{OPTIMIZER}: {e}")))?;
+    Ok((state, network, optimizer))
+}
+
+/// Writes a file so that at any instant its old or its new content is there, whole.
+///
+/// # Errors
+/// Where the operating system refuses.
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".part");
+    let part = PathBuf::from(name);
+    let write = || {
+        let mut file = File::create(&part)?;
+        file.write_all(bytes)?;
+        file.sync_all()?;
+        fs::rename(&part, path)
+    };
+    write().map_err(|source| Error::Io { path: path.into(), source })
+}

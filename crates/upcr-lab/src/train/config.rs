@@ -1,0 +1,137 @@
+//! What a training run is told; its file form is TOML.
+
+use serde::{Deserialize, Serialize};
+use upcr::net::NetworkConfig;
+use upcr::{Error, Result};
+
+use crate::data::pairs::Protocol;
+
+/// A training run. The default is the paper's.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainingConfig {
+    /// Seed of the first weights and of all pairs.
+    pub seed: u64,
+    /// Stages, one after the other: fewer points first make the same network learn many times faster.
+    pub stages: Vec<Stage>,
+    /// Adam's step size at its largest.
+    pub learning_rate: f64,
+    /// How the step size changes over the run.
+    pub decay: Decay,
+    /// Steps at the start over which the step size grows from nothing.
+    pub warmup_steps: u64,
+    /// Shapes held out for validation: every so-many-th of the training split.
+    pub validation_every_nth: usize,
+    /// Passes over the shapes between two validations.
+    pub validation_epochs: u64,
+    /// The network.
+    pub network: NetworkConfig,
+}
+
+/// A part of a run with clouds of one size.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stage {
+    /// Points of a cloud.
+    pub points: usize,
+    /// Pairs of a batch.
+    pub batch: usize,
+    /// Passes over the shapes.
+    pub epochs: u64,
+}
+
+/// How the step size changes over a run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Decay {
+    /// A tenth of itself after 30, 60 and 80 % of the steps.
+    Steps,
+    /// Half a cosine wave down to a hundredth.
+    Cosine,
+    /// None.
+    Constant,
+}
+
+impl Default for TrainingConfig {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            stages: vec![Stage { points: 1024, batch: 26, epochs: 500 }],
+            learning_rate: 1e-3,
+            decay: Decay::Steps,
+            warmup_steps: 0,
+            validation_every_nth: 20,
+            validation_epochs: 5,
+            network: NetworkConfig::default(),
+        }
+    }
+}
+
+impl TrainingConfig {
+    /// A useful model in under an hour of two cores: half the width, and few points but at the end.
+    pub fn quick() -> Self {
+        Self {
+            stages: vec![
+                Stage { points: 256, batch: 26, epochs: 60 },
+                Stage { points: 512, batch: 26, epochs: 8 },
+                Stage { points: 1024, batch: 26, epochs: 3 },
+            ],
+            learning_rate: 2e-3,
+            decay: Decay::Cosine,
+            warmup_steps: 200,
+            network: NetworkConfig { widths: vec![32, 32, 64, 128, 256], ..NetworkConfig::default() },
+            ..Self::default()
+        }
+    }
+
+    /// Reads the file form.
+    ///
+    /// # Errors
+    /// Where the text is no configuration, or one that cannot be run.
+    pub fn from_toml(text: &str) -> Result<Self> {
+        let config: Self = toml::from_str(text)
+            .map_err(|e| Error::InvalidSetting { name: "config", reason: e.to_string() })?;
+        config.check()?;
+        Ok(config)
+    }
+
+    /// The file form.
+    pub fn to_toml(&self) -> String {
+        // Numbers, names and tables of them all have a file form.
+        toml::to_string_pretty(self).unwrap_or_default()
+    }
+
+    /// Refuses what cannot be run.
+    ///
+    /// # Errors
+    /// Where a number is out of its range.
+    pub fn check(&self) -> Result<()> {
+        let refused = |name, reason: &str| Err(Error::InvalidSetting { name, reason: reason.into() });
+        self.network.check()?;
+        if self.stages.iter().any(|s| s.points == 0 || s.batch == 0) || self.stages.is_empty() {
+            return refused("stages", "there must be one at least, each with points and a batch");
+        }
+        if !(self.learning_rate > 0.0 && self.learning_rate.is_finite()) {
+            return refused("learning_rate", "must be positive and finite");
+        }
+        if self.validation_every_nth < 2 {
+            return refused("validation_every_nth", "must be 2 at least: something must be left to learn from");
+        }
+        Ok(())
+    }
+
+    /// The step size at a step of so many.
+    pub fn step_size(&self, step: u64, steps: u64) -> f64 {
+        let done = step as f64 / steps.max(1) as f64;
+        let decay = match self.decay {
+            Decay::Steps => [0.3, 0.6, 0.8].iter().filter(|&&at| done >= at).fold(1.0, |d, _| d * 0.1),
+            Decay::Cosine => 0.01 + 0.99 * 0.5 * (1.0 + (std::f64::consts::PI * done).cos()),
+            Decay::Constant => 1.0,
+        };
+        let warm = ((step + 1) as f64 / self.warmup_steps.max(1) as f64).min(1.0);
+        self.learning_rate * decay * warm
+    }
+}
+
+/// Protocols and how often each is taken.
+pub type Mixture = Vec<(Protocol, f64)>;

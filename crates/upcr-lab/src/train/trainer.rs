@@ -1,0 +1,332 @@
+//! The training loop.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use burn::module::Module;
+use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
+use burn::tensor::Device;
+use upcr::net::NetworkConfig;
+use upcr::{Error, Result, Rigid};
+
+use super::checkpoint::{self, State};
+use super::config::{Mixture, Stage, TrainingConfig};
+use super::history::{Event, History, ValidationErrors, Watcher};
+use crate::data::Shapes;
+use crate::data::loader::{Example, Loader, Plan, Position, Training};
+use crate::eval::metrics::{PoseErrors, recall};
+use crate::models::weights::{store, TensorFile};
+use crate::models::{CloudInput, Clouds, Statistics, Upcr, init};
+use crate::random;
+
+/// Share of a batch in the running statistics of batch norm.
+const STATISTICS_SHARE: f64 = 0.1;
+/// Time between checkpoints.
+const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
+/// Time between events.
+const EVENT_EVERY: Duration = Duration::from_secs(10);
+/// Threads that make batches: neighbours and features cost far less than a step.
+const LOADER_THREADS: usize = 1;
+/// The file in a run's folder with which it goes on.
+const CHECKPOINT: &str = "checkpoint.safetensors";
+/// A pose is right within these (protocols: objects in the unit sphere).
+const MAX_ROTATION_DEG: f64 = 5.0;
+const MAX_TRANSLATION: f64 = 0.2;
+
+/// A training run.
+pub struct Trainer {
+    folder: PathBuf,
+    network: Upcr,
+    optimizer: ModuleOptimizer,
+    state: State,
+}
+
+/// Pairs with known poses, to see how far a network has come.
+#[derive(Debug)]
+pub struct Validation {
+    batches: Vec<(Clouds, Vec<Rigid>)>,
+}
+
+impl Validation {
+    /// The mixture's own pairs of every shape.
+    ///
+    /// # Errors
+    /// Where a shape has too few points.
+    pub fn new(shapes: &Shapes, mixture: &Mixture, points: usize, config: &NetworkConfig) -> Result<Self> {
+        const BATCH: usize = 32;
+        let mut batches = Vec::new();
+        for (protocol, _) in mixture {
+            let protocol = protocol.keeping(points);
+            let items: Vec<usize> = (0..shapes.len()).collect();
+            for items in items.chunks(BATCH) {
+                let mut pairs = Vec::new();
+                let mut truths = Vec::new();
+                for &item in items {
+                    let pair = protocol.pair(&shapes.points(item), item as u64)?;
+                    let [source, target] = [&pair.source, &pair.target].map(|cloud| {
+                        let points: Vec<[f32; 3]> =
+                            cloud.points.iter().map(|p| p.map(|v| v as f32)).collect();
+                        CloudInput::new(&points, config)
+                    });
+                    pairs.push((source?, target?));
+                    truths.push(pair.T_target_source);
+                }
+                batches.push((Clouds::new(&pairs, config.k), truths));
+            }
+        }
+        Ok(Self { batches })
+    }
+}
+
+/// Errors of a network, with its running statistics.
+pub fn validate(network: &Upcr, validation: &Validation) -> ValidationErrors {
+    let network = network.valid();
+    let mut poses = Vec::new();
+    let mut losses = Vec::new();
+    for (clouds, truths) in &validation.batches {
+        let output = network.forward(clouds, Statistics::Running);
+        losses.extend(output.loss(clouds).into_data().iter::<f32>().map(f64::from));
+        poses.extend(output.poses(clouds).into_iter().zip(truths.iter().copied()));
+    }
+    let errors = PoseErrors::of(&poses);
+    ValidationErrors {
+        loss: losses.iter().sum::<f64>() / losses.len().max(1) as f64,
+        mae_r_deg: errors.euler_mae_deg,
+        mae_t: errors.translation_mae,
+        recall: recall(&poses, MAX_ROTATION_DEG, MAX_TRANSLATION),
+    }
+}
+
+impl Trainer {
+    /// A new run, whose files come to `folder`.
+    ///
+    /// # Errors
+    /// Where the configuration cannot be run.
+    pub fn new(config: TrainingConfig, folder: &Path, device: &Device) -> Result<Self> {
+        config.check()?;
+        let device = device.clone().autodiff();
+        let network = init(&config.network, &mut random::stream(config.seed, u64::MAX), &device)?;
+        let state = State { config, step: 0, seconds: 0.0, history: History::new() };
+        Ok(Self { folder: folder.into(), network, optimizer: adam(), state })
+    }
+
+    /// A run on weights that were learned before.
+    ///
+    /// # Errors
+    /// Where the configuration cannot be run.
+    pub fn from_network(config: TrainingConfig, network: Upcr, folder: &Path) -> Result<Self> {
+        config.check()?;
+        let state = State { config, step: 0, seconds: 0.0, history: History::new() };
+        Ok(Self { folder: folder.into(), network, optimizer: adam(), state })
+    }
+
+    /// Goes on where the run in `folder` was stopped.
+    ///
+    /// # Errors
+    /// Where there is no checkpoint, or it is damaged.
+    pub fn resume(folder: &Path, device: &Device) -> Result<Self> {
+        let path = folder.join(CHECKPOINT);
+        let (state, network, optimizer) = checkpoint::load(&path, adam(), &device.clone().autodiff())?;
+        Ok(Self { folder: folder.into(), network, optimizer, state })
+    }
+
+    /// The network as it is now.
+    pub fn network(&self) -> &Upcr {
+        &self.network
+    }
+
+    /// What the run was told.
+    pub fn config(&self) -> &TrainingConfig {
+        &self.state.config
+    }
+
+    /// The learning curve so far.
+    pub fn history(&self) -> &History {
+        &self.state.history
+    }
+
+    /// The weights as a file.
+    pub fn weights(&self) -> TensorFile {
+        store(&self.network)
+    }
+
+    /// Trains to the end, or until the watcher says stop; `true` at the end. `shapes` are split into those to learn
+    /// from and those held out.
+    ///
+    /// # Errors
+    /// Where a shape has too few points, a file cannot be written, or the loss is no longer finite.
+    pub fn run(&mut self, shapes: &Shapes, mixture: &Mixture, watcher: &mut dyn Watcher) -> Result<bool> {
+        let config = self.state.config.clone();
+        let (learned, held_out) = shapes.split_every_nth(config.validation_every_nth);
+        self.run_on(&Arc::new(learned), &held_out, mixture, watcher)
+    }
+
+    /// The same with given sets.
+    ///
+    /// # Errors
+    /// As [`Self::run`].
+    pub fn run_on(
+        &mut self,
+        shapes: &Arc<Shapes>,
+        held_out: &Shapes,
+        mixture: &Mixture,
+        watcher: &mut dyn Watcher,
+    ) -> Result<bool> {
+        let config = self.state.config.clone();
+        let lengths: Vec<u64> = config.stages.iter().map(|stage| stage.steps(shapes.len())).collect();
+        let steps = lengths.iter().sum();
+        let mut before = 0;
+        for ((index, stage), length) in config.stages.iter().enumerate().zip(&lengths) {
+            let end = before + length;
+            if self.state.step < end {
+                let later: u64 = config.stages[index + 1..]
+                    .iter()
+                    .zip(&lengths[index + 1..])
+                    .map(|(stage, steps)| steps * 2 * stage.batch as u64)
+                    .sum();
+                let place = Place { index, stage, first: before, end, steps, later };
+                let validation = Validation::new(held_out, mixture, stage.points, &config.network)?;
+                if !self.stage(shapes, &validation, mixture, &place, watcher)? {
+                    self.save()?;
+                    return Ok(false);
+                }
+            }
+            before = end;
+        }
+        self.save()?;
+        Ok(true)
+    }
+
+    fn stage(
+        &mut self,
+        shapes: &Arc<Shapes>,
+        validation: &Validation,
+        mixture: &Mixture,
+        place: &Place,
+        watcher: &mut dyn Watcher,
+    ) -> Result<bool> {
+        let config = self.state.config.clone();
+        let per_epoch = place.stage.steps_per_epoch(shapes.len());
+        let done = self.state.step - place.first;
+        let plan = Plan::Training(Training {
+            mixture: mixture.clone(),
+            points: place.stage.points,
+            seed: random::fnv1a(&format!("{} stage {}", config.seed, place.index)),
+            from: Position { epoch: done / per_epoch, batch: done % per_epoch },
+        });
+        let network_config = config.network.clone();
+        let prepare = move |example: &Example| {
+            let cloud = |points| CloudInput::new(points, &network_config);
+            Ok((cloud(&example.source)?, cloud(&example.target)?))
+        };
+        let mut batches = Loader::start(shapes, &plan, place.stage.batch, LOADER_THREADS, prepare)?;
+        let mut since = Since::default();
+        let mut saved = Instant::now();
+        while self.state.step < place.end {
+            let start = Instant::now();
+            let Some(batch) = batches.next().transpose()? else { break };
+            let clouds = Clouds::new(&batch.prepared, config.network.k);
+            let rate = config.step_size(self.state.step, place.steps);
+            let loss = self.step(&clouds, rate)?;
+            self.state.step += 1;
+            since.loss += loss;
+            since.steps += 1;
+            since.seconds += start.elapsed().as_secs_f64();
+            self.state.seconds += start.elapsed().as_secs_f64();
+
+            let step = self.state.step;
+            let validates = (step - place.first) % (per_epoch * config.validation_epochs.max(1)) == 0
+                || step == place.end;
+            if validates || since.told.elapsed() >= EVENT_EVERY {
+                let event = Event {
+                    step,
+                    steps: place.steps,
+                    points: place.stage.points,
+                    loss: since.loss / since.steps as f64,
+                    validation: validates.then(|| validate(&self.network, validation)),
+                    learning_rate: rate,
+                    clouds_per_second: (since.steps * 2 * place.stage.batch) as f64 / since.seconds,
+                    seconds: self.state.seconds,
+                };
+                if validates {
+                    self.state.history.push(event);
+                }
+                let left = (place.end - step) * 2 * place.stage.batch as u64 + place.later;
+                watcher.event(&event, left);
+                since = Since::default();
+            }
+            if watcher.stop() {
+                return Ok(false);
+            }
+            if saved.elapsed() >= CHECKPOINT_EVERY {
+                self.save()?;
+                saved = Instant::now();
+            }
+        }
+        Ok(true)
+    }
+
+    /// One step of Adam on a batch; its mean loss.
+    ///
+    /// # Errors
+    /// Where the loss is not finite.
+    pub fn step(&mut self, clouds: &Clouds, rate: f64) -> Result<f64> {
+        let output = self.network.forward(clouds, Statistics::Batch);
+        let loss = output.loss(clouds).mean();
+        let value = f64::from(loss.clone().into_scalar::<f32>());
+        if !value.is_finite() {
+            let reason = format!("the loss became {value} at step {}", self.state.step);
+            return Err(Error::InvalidSetting { name: "learning_rate", reason });
+        }
+        let gradients = GradientsParams::from_grads(loss.backward(), &self.network);
+        let network = self.optimizer.step(rate, self.network.clone(), gradients);
+        self.network = network.observed(&output.statistics, STATISTICS_SHARE);
+        Ok(value)
+    }
+
+    /// Writes the checkpoint.
+    fn save(&self) -> Result<()> {
+        checkpoint::save(&self.folder.join(CHECKPOINT), &self.state, &self.network, &self.optimizer)
+    }
+}
+
+/// What has been summed since the last event.
+struct Since {
+    loss: f64,
+    steps: usize,
+    seconds: f64,
+    told: Instant,
+}
+
+impl Default for Since {
+    fn default() -> Self {
+        Self { loss: 0.0, steps: 0, seconds: 0.0, told: Instant::now() }
+    }
+}
+
+/// A stage's place in the run.
+struct Place<'a> {
+    index: usize,
+    stage: &'a Stage,
+    /// Steps of the run before it and to its end, and of the whole run.
+    first: u64,
+    end: u64,
+    steps: u64,
+    /// Clouds of the stages after it.
+    later: u64,
+}
+
+impl Stage {
+    fn steps_per_epoch(&self, shapes: usize) -> u64 {
+        (shapes / self.batch).max(1) as u64
+    }
+
+    fn steps(&self, shapes: usize) -> u64 {
+        self.epochs * self.steps_per_epoch(shapes)
+    }
+}
+
+fn adam() -> ModuleOptimizer {
+    AdamConfig::new().with_epsilon(1e-8).init()
+}
