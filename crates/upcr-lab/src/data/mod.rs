@@ -1,10 +1,16 @@
 //! Where the lab's clouds come from: data sets of shapes, registration protocols over them, and a virtual scanner.
 
+mod folder;
 mod hdf5;
 pub mod loader;
+mod modelnet10;
 mod modelnet40;
+mod normalize;
+mod npz;
+mod number;
 pub mod pairs;
 pub mod scanner;
+pub mod seven_scenes;
 
 use std::path::Path;
 
@@ -51,7 +57,8 @@ struct DataSet {
 }
 
 /// Every kind there is; the first that recognises a path reads it. A new one is a file of its own and a line here.
-static DATA_SETS: &[DataSet] = &[modelnet40::DATA_SET];
+static DATA_SETS: &[DataSet] =
+    &[modelnet40::DATA_SET, modelnet10::DATA_SET, seven_scenes::DATA_SET, folder::DATA_SET];
 
 /// Reads a data set, whose kind is told by what is at `path`.
 ///
