@@ -622,7 +622,7 @@ mod tests {
         for (file, name, expected) in [
             (EARLIEST, "data", counted(&[7, 5, 3], quarters)),
             (EARLIEST, "label", counted(&[7, 1], |i| i)),
-            (EARLIEST, "gzip", counted(&[40, 3], quarters)),
+            (EARLIEST, "gzip", counted(&[100, 3], quarters)),
             (EARLIEST, "plain", counted(&[9], |i| i)),
             (EARLIEST, "other17", counted(&[], |_| 17.0)),
             (LATEST, "data", counted(&[4, 3], quarters)),
