@@ -146,8 +146,8 @@ impl Protocol {
     /// # Errors
     /// Where such a shape has fewer points than the protocol asks for, or the outlier ratio is no ratio.
     pub fn check(&self, len: usize) -> Result<()> {
-        if self.points == 0 {
-            return Err(Error::InvalidSetting { name: "points", reason: "must be 1 at least".into() });
+        if self.kept() == 0 {
+            return Err(Error::InvalidSetting { name: "points", reason: "must leave 1 at least".into() });
         }
         if !(0.0..=1.0).contains(&self.outlier_ratio) {
             return Err(Error::InvalidSetting { name: "outlier_ratio", reason: "must lie in 0 to 1".into() });
@@ -273,11 +273,13 @@ impl ClippedNoise {
 /// Keeps the `count` points nearest to `viewpoint`, in their order.
 fn keep_nearest(points: &mut Vec<[f64; 3]>, viewpoint: &Vector3<f64>, count: usize) {
     let distance = |p: &[f64; 3]| (Vector3::from(*p) - viewpoint).norm_squared();
-    let mut nearest: Vec<usize> = (0..points.len()).collect();
-    nearest.sort_by(|&a, &b| distance(&points[a]).total_cmp(&distance(&points[b])));
-    nearest.truncate(count);
-    nearest.sort_unstable();
-    *points = nearest.into_iter().map(|i| points[i]).collect();
+    let mut nearest: Vec<(f64, usize)> = points.iter().map(distance).zip(0..).collect();
+    if count < nearest.len() {
+        nearest.select_nth_unstable_by(count, |a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        nearest.truncate(count);
+        nearest.sort_unstable_by_key(|&(_, i)| i);
+    }
+    *points = nearest.into_iter().map(|(_, i)| points[i]).collect();
 }
 
 /// Replaces the leading points, whose order is random already, by points uniform in the bounding box.
@@ -486,6 +488,7 @@ mod tests {
         assert!(Protocol::CONSISTENT.pair(&shape()[..1000], 0).is_err());
         assert!(Protocol::CONSISTENT.with_outliers(1.1).pair(&shape(), 0).is_err());
         assert!(Protocol::CONSISTENT.keeping(0).pair(&shape(), 0).is_err());
+        assert!(Protocol { points: 1, ..Protocol::PARTIAL_SHARED }.pair(&shape(), 0).is_err());
         assert!(Protocol::PARTIAL_SHARED.keeping(1600).pair(&shape(), 0).is_err());
     }
 }

@@ -63,13 +63,65 @@ impl PoseErrors {
     }
 }
 
-/// Share of (estimate, truth) pairs within both an angle and a distance; NaN over none.
-pub fn recall(poses: &[(Rigid, Rigid)], max_rotation_deg: f64, max_translation: f64) -> f64 {
-    let within = |(estimate, truth): &&(Rigid, Rigid)| {
-        rotation_error_deg(estimate, truth) <= max_rotation_deg
-            && (estimate.translation - truth.translation).norm() <= max_translation
+/// How far off a pose may be to count as found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tolerance {
+    /// Angle between the rotations.
+    pub rotation_deg: f64,
+    /// Length of the difference of the translations, in the clouds' unit.
+    pub translation: f64,
+}
+
+/// How many poses are found, of how many.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Recall {
+    /// Poses within the tolerance.
+    pub found: usize,
+    /// All poses.
+    pub of: usize,
+}
+
+impl Tolerance {
+    /// Indoor scenes, in metres.
+    pub const INDOOR: Self = Self { rotation_deg: 5.0, translation: 0.3 };
+
+    /// Lidar on a car, in metres.
+    pub const DRIVING: Self = Self { rotation_deg: 2.0, translation: 0.6 };
+
+    /// An object of a given diameter.
+    pub fn object(diameter: f64) -> Self {
+        Self { rotation_deg: 5.0, translation: 0.1 * diameter }
+    }
+
+    /// Whether an estimate lies within it.
+    pub fn holds(&self, estimate: &Rigid, truth: &Rigid) -> bool {
+        rotation_error_deg(estimate, truth) <= self.rotation_deg
+            && (estimate.translation - truth.translation).norm() <= self.translation
+    }
+}
+
+impl Recall {
+    /// Of (estimate, truth) pairs, each with its tolerance.
+    pub fn of(poses: &[(Rigid, Rigid)], tolerance: impl Fn(usize) -> Tolerance) -> Self {
+        let found = (poses.iter().enumerate())
+            .filter(|(i, (estimate, truth))| tolerance(*i).holds(estimate, truth))
+            .count();
+        Self { found, of: poses.len() }
+    }
+
+    /// Share of the poses, 0 to 1; NaN over none.
+    pub fn share(&self) -> f64 {
+        self.found as f64 / self.of as f64
+    }
+}
+
+/// Largest distance between two of the points; 0 for none. Takes time quadratic in their number.
+pub fn diameter(points: &[[f64; 3]]) -> f64 {
+    let farthest = |(i, p): (usize, &[f64; 3])| {
+        let distance_sq = |q: &[f64; 3]| (Vector3::from(*p) - Vector3::from(*q)).norm_squared();
+        points[i + 1..].iter().map(distance_sq).fold(0.0, f64::max)
     };
-    poses.iter().filter(within).count() as f64 / poses.len() as f64
+    points.iter().enumerate().map(farthest).fold(0.0, f64::max).sqrt()
 }
 
 /// Angle of the rotation between two poses, 0 to 180 degrees.
@@ -157,9 +209,29 @@ mod tests {
             assert!((found - expected).abs() < 1e-9, "{found} {expected}");
         }
         assert!(PoseErrors::of(&[]).euler_rmse_deg.is_nan());
-        for (deg, distance, expected) in [(5.9, 9.0, 0.5), (6.1, 4.9, 0.5), (6.1, 5.1, 1.0)] {
-            assert!((recall(&poses, deg, distance) - expected).abs() < 1e-12);
+    }
+
+    #[test]
+    fn recall_counts_what_is_within_both_tolerances() {
+        let mut off = about([0.0, 0.0, 1.0], 6.0);
+        off.translation = Vector3::new(3.0, 0.0, -4.0);
+        let poses = [(off, Rigid::identity()), (off, off)];
+        for (rotation_deg, translation, found) in [(5.9, 9.0, 1), (6.1, 4.9, 1), (6.1, 5.1, 2)] {
+            let recall = Recall::of(&poses, |_| Tolerance { rotation_deg, translation });
+            assert_eq!(recall, Recall { found, of: 2 });
+            assert_eq!(recall.share(), found as f64 / 2.0);
         }
+        let wide = Tolerance { rotation_deg: 7.0, ..Tolerance::object(51.0) };
+        assert_eq!(Recall::of(&poses, |i| if i == 0 { Tolerance::DRIVING } else { wide }).found, 1);
+        assert_eq!(Recall::of(&poses, |_| wide).found, 2);
+        assert!(Recall::of(&[], |_| wide).share().is_nan());
+    }
+
+    #[test]
+    fn diameters_are_those_of_the_farthest_points() {
+        let corners = (0..8).map(|i| [i & 1, i >> 1 & 1, i >> 2].map(f64::from).map(|v| 3.0 * v + 1.0));
+        assert!((diameter(&corners.collect::<Vec<_>>()) - 27.0_f64.sqrt()).abs() < 1e-12);
+        assert_eq!((diameter(&[]), diameter(&[[1.0; 3]])), (0.0, 0.0));
     }
 
     #[test]

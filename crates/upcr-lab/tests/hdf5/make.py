@@ -16,7 +16,8 @@ def count(shape, dtype):
 with h5py.File("earliest.h5", "w", libver="earliest") as file:
     file.create_dataset("data", data=count((7, 5, 3), "<f4"), chunks=(2, 3, 2), compression="gzip", shuffle=True)
     file.create_dataset("label", data=count((7, 1), "u1"))
-    file.create_dataset("gzip", data=count((40, 3), ">f8"), chunks=(1, 3), compression="gzip")
+    # More chunks than one node of the tree holds.
+    file.create_dataset("gzip", data=count((100, 3), ">f8"), chunks=(1, 3), compression="gzip")
     file.create_dataset("plain", data=count((9,), "<i2"), chunks=(4,))
     file.create_dataset("checked", data=count((9,), "<i8"), chunks=(4,), fletcher32=True)
     file.create_dataset("text", data=b"words")
