@@ -1,5 +1,7 @@
 //! The unsupervised loss (equation 7): the Chamfer distance between two clouds in their canonical poses.
 
+use std::array::from_fn;
+
 use multiversion::multiversion;
 use rayon::prelude::*;
 
@@ -61,7 +63,7 @@ pub fn forward(rotations: &[f32], translations: &[f32], clouds: &PairPoints) -> 
 pub(super) fn canonical(points: &[[f32; 3]], rotation: &[f32], t: &[f32]) -> Vec<[f32; 3]> {
     let turned = |p: &[f32; 3]| {
         let d = [p[0] - t[0], p[1] - t[1], p[2] - t[2]];
-        std::array::from_fn(|c| (0..3).map(|r| rotation[r * 3 + c] * d[r]).sum())
+        from_fn(|c| (0..3).map(|r| rotation[r * 3 + c] * d[r]).sum())
     };
     points.iter().map(turned).collect()
 }
@@ -101,7 +103,7 @@ fn pose_gradients(
         }
     }
     let grad_t = |r: usize| -(0..3).map(|c| f64::from(rotation[r * 3 + c]) * sum[c]).sum::<f64>();
-    (grad_rotation, std::array::from_fn(grad_t))
+    (grad_rotation, from_fn(grad_t))
 }
 
 /// For every point of `x` the index of the nearest of `y`, the first of equally near ones.
@@ -128,13 +130,15 @@ fn search(x: &[[f32; 3]], coordinates: &[f32], padded: usize, nearest: &mut [u32
             .zip(ys.as_chunks::<LANES>().0)
             .zip(zs.as_chunks::<LANES>().0);
         for (at, ((xs, ys), zs)) in (0_i32..).zip(blocks) {
+            let (mut next_best, mut next_block) = ([0.0; LANES], [0; LANES]);
             for l in 0..LANES {
                 let (dx, dy, dz) = (xs[l] - p[0], ys[l] - p[1], zs[l] - p[2]);
                 let distance_sq = dx * dx + dy * dy + dz * dz;
                 let nearer = distance_sq < best[l];
-                best[l] = if nearer { distance_sq } else { best[l] };
-                block[l] = if nearer { at } else { block[l] };
+                next_best[l] = if nearer { distance_sq } else { best[l] };
+                next_block[l] = if nearer { at } else { block[l] };
             }
+            (best, block) = (next_best, next_block);
         }
         let mut found = (f32::INFINITY, u32::MAX);
         for l in 0..LANES {

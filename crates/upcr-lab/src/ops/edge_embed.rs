@@ -8,6 +8,7 @@ use rayon::prelude::*;
 use upcr::net::InvariantInputs;
 
 use super::batch::BatchGraph;
+use super::buffer::Buffer;
 use super::graph_layer::{EdgeStatistics, Norm, Parameters, ordered_sum, signs, through_rectifier};
 use super::product::{Matrix, product};
 
@@ -25,8 +26,8 @@ pub struct EdgeInputs {
 /// What the gradients need of the values.
 #[derive(Debug, Default)]
 pub struct Kept {
-    largest: Vec<f32>,
-    winners: Vec<u8>,
+    largest: Buffer<f32>,
+    winners: Buffer<u8>,
     /// The weight with signs turned.
     turned: Vec<f32>,
     norm: Norm,
@@ -192,7 +193,7 @@ pub fn backward(
             let of = |width: usize| rows.start * width..rows.end * width;
             let mut found = vec![0.0; (2 + dim) * outputs];
             let (totals, weight) = found.split_at_mut(2 * outputs);
-            let mut winning = vec![0.0; rows.len() * outputs];
+            let mut winning = Buffer::new(rows.len() * outputs);
             let (largest, grad_out) = (&kept.largest[of(outputs)], &grad_out[of(outputs)]);
             through_rectifier(largest, grad_out, norm, parameters.negative_slope, &mut winning, totals);
             let winners = &kept.winners[of(outputs)];
@@ -255,9 +256,10 @@ fn turn(parameters: &Parameters) -> Vec<f32> {
 }
 
 /// The largest v over every row's edges, and its place.
-fn gathered(inputs: &EdgeInputs, turned: &[f32], outputs: usize, graph: &BatchGraph) -> (Vec<f32>, Vec<u8>) {
+fn gathered(inputs: &EdgeInputs, turned: &[f32], outputs: usize, graph: &BatchGraph) -> (Buffer<f32>, Buffer<u8>) {
     let (edge_dim, point_dim) = (inputs.phi.edge_dim, inputs.phi.point_dim);
-    let (mut largest, mut winners) = (vec![0.0; graph.rows() * outputs], vec![0; graph.rows() * outputs]);
+    let values = graph.rows() * outputs;
+    let (mut largest, mut winners) = (Buffer::new(values), Buffer::new(values));
     graph
         .split_mut(&mut largest, outputs)
         .into_par_iter()
@@ -301,7 +303,10 @@ fn gather(
             for (place, &j) in (0_i32..).zip(&neighbors[i * k..(i + 1) * k]) {
                 let mut v = [0.0; N];
                 let b = &by_neighbor[j as usize * outputs + first..];
-                v[..lanes].copy_from_slice(&b[..lanes]);
+                match b.first_chunk() {
+                    Some(b) => v = *b,
+                    None => v[..lanes].copy_from_slice(&b[..lanes]),
+                }
                 let edge = &edges[(i * k + place as usize) * edge_dim..][..edge_dim];
                 for (a, &x) in edge.iter().enumerate() {
                     let w = &weight[a * outputs + first..];
@@ -313,11 +318,13 @@ fn gather(
                         v.iter_mut().zip(w).for_each(|(v, w)| *v += x * w);
                     }
                 }
+                let (mut next_best, mut next_winner) = ([0.0; N], [0; N]);
                 for c in 0..N {
                     let larger = v[c] > best[c];
-                    best[c] = if larger { v[c] } else { best[c] };
-                    winner[c] = if larger { place } else { winner[c] };
+                    next_best[c] = if larger { v[c] } else { best[c] };
+                    next_winner[c] = if larger { place } else { winner[c] };
                 }
+                (best, winner) = (next_best, next_winner);
             }
             let at = i * outputs + first;
             largest[at..at + lanes].copy_from_slice(&best[..lanes]);

@@ -9,6 +9,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::batch::{BatchGraph, CloudGraph};
+use super::buffer::Buffer;
 use super::product::{Matrix, product};
 
 /// Added to variances (as PyTorch and burn do by default).
@@ -42,13 +43,13 @@ pub struct EdgeStatistics {
 #[derive(Debug, Default)]
 pub struct Kept {
     /// [A | B] of every row, signs turned.
-    products: Vec<f32>,
+    products: Buffer<f32>,
     /// Aᵢ + maxⱼ Bⱼ.
-    largest: Vec<f32>,
+    largest: Buffer<f32>,
     /// Σⱼ v of every row.
-    sums: Vec<f32>,
+    sums: Buffer<f32>,
     /// The neighbour, by its place in the row, that has the maximum.
-    winners: Vec<u8>,
+    winners: Buffer<u8>,
     /// [W₁ - W₂ | W₂] with signs turned, `[inputs, 2 · outputs]`.
     folded: Vec<f32>,
     norm: Norm,
@@ -125,10 +126,10 @@ pub fn forward(
 ) -> (Vec<f32>, EdgeStatistics, Kept) {
     let outputs = parameters.gamma.len();
     let mut kept = Kept {
-        products: vec![0.0; graph.rows() * 2 * outputs],
-        largest: vec![0.0; graph.rows() * outputs],
-        sums: vec![0.0; graph.rows() * outputs],
-        winners: vec![0; graph.rows() * outputs],
+        products: Buffer::new(graph.rows() * 2 * outputs),
+        largest: Buffer::new(graph.rows() * outputs),
+        sums: Buffer::new(graph.rows() * outputs),
+        winners: Buffer::new(graph.rows() * outputs),
         folded: fold(parameters),
         norm: Norm::default(),
     };
@@ -177,10 +178,10 @@ pub fn forward_with(
     let clouds = graph.split_mut(&mut out, outputs);
     clouds.into_par_iter().enumerate().with_max_len(1).for_each(|(cloud, out)| {
         let rows = graph.cloud(cloud).len();
-        let mut products = vec![0.0; rows * 2 * outputs];
+        let mut products = Buffer::new(rows * 2 * outputs);
         point_products(features, graph, cloud, &folded, &mut products);
-        let mut largest = vec![0.0; rows * outputs];
-        let (mut sums, mut winners) = (vec![0.0; rows * outputs], vec![0; rows * outputs]);
+        let mut largest = Buffer::new(rows * outputs);
+        let (mut sums, mut winners) = (Buffer::new(rows * outputs), Buffer::new(rows * outputs));
         gather(&graph.view(cloud), &products, &mut largest, &mut sums, &mut winners, &mut vec![0.0; 2 * outputs]);
         normalize(&largest, &norm.scale, &norm.shift, parameters.negative_slope, out);
     });
@@ -199,7 +200,7 @@ pub fn backward(
     let outputs = parameters.gamma.len();
     let inputs = parameters.weight.len() / (2 * outputs);
     let norm = &kept.norm;
-    let mut winning = vec![0.0; graph.rows() * outputs];
+    let mut winning = Buffer::new(graph.rows() * outputs);
     let totals: Vec<Vec<f32>> = graph
         .split_mut(&mut winning, outputs)
         .into_par_iter()
@@ -237,13 +238,11 @@ pub fn backward(
         .enumerate()
         .map(|(part, clouds)| {
             let mut grad_folded = vec![0.0; inputs * 2 * outputs];
-            let mut grad_products = Vec::new();
             for (cloud, grad_features) in clouds.iter_mut().enumerate() {
                 let cloud = part * clouds_a_part + cloud;
                 let rows = graph.cloud(cloud);
                 let of = |width: usize| rows.start * width..rows.end * width;
-                grad_products.clear();
-                grad_products.resize(rows.len() * 2 * outputs, 0.0);
+                let mut grad_products = Buffer::new(rows.len() * 2 * outputs);
                 scatter(
                     &graph.view(cloud),
                     &kept.products[of(2 * outputs)],
@@ -348,6 +347,10 @@ fn gather(
         gather_block::<32>(graph, products, first, largest, sums, winners, totals);
         first += 32;
     }
+    while first + 16 <= outputs {
+        gather_block::<16>(graph, products, first, largest, sums, winners, totals);
+        first += 16;
+    }
     while first + 8 <= outputs {
         gather_block::<8>(graph, products, first, largest, sums, winners, totals);
         first += 8;
@@ -387,12 +390,15 @@ fn gather_block<const N: usize>(
         let mut sum = [0.0; N];
         for (place, &j) in (0_i32..).zip(graph.row(i)) {
             let b = lanes::<N>(products, j as usize * width + outputs + first);
+            // New arrays: written in place, `best` would go through memory and be five times slower.
+            let (mut next_best, mut next_winner) = ([0.0; N], [0; N]);
             for c in 0..N {
                 let larger = b[c] > best[c];
-                best[c] = if larger { b[c] } else { best[c] };
-                winner[c] = if larger { place } else { winner[c] };
+                next_best[c] = if larger { b[c] } else { best[c] };
+                next_winner[c] = if larger { place } else { winner[c] };
                 sum[c] += b[c];
             }
+            (best, winner) = (next_best, next_winner);
         }
         let a = lanes::<N>(products, i * width + first);
         let b = lanes::<N>(products, i * width + outputs + first);
@@ -424,21 +430,45 @@ pub(super) fn through_rectifier(
     totals: &mut [f32],
 ) {
     let outputs = norm.scale.len();
-    let (sums, products) = totals.split_at_mut(outputs);
-    let (scale, shift, mean) = (&norm.scale[..outputs], &norm.shift[..outputs], &norm.mean[..outputs]);
-    for ((winning, largest), grad_out) in winning
-        .chunks_exact_mut(outputs)
-        .zip(largest.chunks_exact(outputs))
-        .zip(grad_out.chunks_exact(outputs))
-    {
-        for c in 0..outputs {
-            let positive = largest[c] * scale[c] + shift[c] > 0.0;
-            let gradient = if positive { grad_out[c] } else { negative_slope * grad_out[c] };
+    let mut first = 0;
+    while first + 16 <= outputs {
+        rectifier_block::<16>(largest, grad_out, norm, negative_slope, first, winning, totals);
+        first += 16;
+    }
+    while first < outputs {
+        rectifier_block::<1>(largest, grad_out, norm, negative_slope, first, winning, totals);
+        first += 1;
+    }
+}
+
+#[inline(always)]
+fn rectifier_block<const N: usize>(
+    largest: &[f32],
+    grad_out: &[f32],
+    norm: &Norm,
+    negative_slope: f32,
+    first: usize,
+    winning: &mut [f32],
+    totals: &mut [f32],
+) {
+    let outputs = norm.scale.len();
+    let (scale, shift) = (*lanes::<N>(&norm.scale, first), *lanes::<N>(&norm.shift, first));
+    let mean = *lanes::<N>(&norm.mean, first);
+    let (mut sums, mut products) = ([0.0; N], [0.0; N]);
+    for (i, winning) in winning.chunks_exact_mut(outputs).enumerate() {
+        let value = lanes::<N>(largest, i * outputs + first);
+        let grad_out = lanes::<N>(grad_out, i * outputs + first);
+        let Some(winning) = winning[first..].first_chunk_mut::<N>() else { continue };
+        for c in 0..N {
+            let positive = value[c] * scale[c] + shift[c] > 0.0;
+            let gradient = grad_out[c] * if positive { 1.0 } else { negative_slope };
             sums[c] += gradient;
-            products[c] += gradient * (largest[c] - mean[c]);
+            products[c] += gradient * (value[c] - mean[c]);
             winning[c] = gradient * scale[c];
         }
     }
+    totals[first..first + N].copy_from_slice(&sums);
+    totals[outputs + first..outputs + first + N].copy_from_slice(&products);
 }
 
 /// Gradients of a cloud's [A | B]: to the winner what its maximum is worth, to every edge -(share + slope · v).
@@ -460,6 +490,10 @@ fn scatter(
         spread_block::<32>(graph, products, first, share, slope, grad_products);
         first += 32;
     }
+    while first + 16 <= outputs {
+        spread_block::<16>(graph, products, first, share, slope, grad_products);
+        first += 16;
+    }
     while first + 8 <= outputs {
         spread_block::<8>(graph, products, first, share, slope, grad_products);
         first += 8;
@@ -469,6 +503,8 @@ fn scatter(
         first += 1;
     }
     let k = graph.k as f32;
+    // Where the rows of B of a point's neighbours start; a place among the neighbours is a byte.
+    let mut starts = [0_usize; 256];
     for i in 0..graph.rows() {
         let at = i * outputs..(i + 1) * outputs;
         let (sums, winning, winners) = (&sums[at.clone()], &winning[at.clone()], &winners[at]);
@@ -476,9 +512,11 @@ fn scatter(
         for c in 0..outputs {
             own[c] = winning[c] - k * share[c] - slope[c] * sums[c];
         }
-        let row = graph.row(i);
+        for (start, &j) in starts.iter_mut().zip(graph.row(i)) {
+            *start = j as usize * 2 * outputs + outputs;
+        }
         for (c, (&winner, gradient)) in winners.iter().zip(winning).enumerate() {
-            grad_products[row[winner as usize] as usize * 2 * outputs + outputs + c] += gradient;
+            grad_products[starts[winner as usize] + c] += gradient;
         }
     }
 }

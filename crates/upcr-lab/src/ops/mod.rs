@@ -5,6 +5,7 @@
 //! the same operations are written with the framework's own tensors (`generic`).
 
 pub mod batch;
+mod buffer;
 pub mod canonical_chamfer;
 pub mod edge_embed;
 mod extension;

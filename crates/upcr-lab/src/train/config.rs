@@ -34,6 +34,10 @@ pub struct TrainingConfig {
 pub struct Stage {
     /// Points of a cloud.
     pub points: usize,
+    /// Neighbours of a point; as many as the network's where none are told. With fewer points, fewer neighbours
+    /// reach as far.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub k: Option<usize>,
     /// Pairs of a batch.
     pub batch: usize,
     /// Passes over the shapes.
@@ -56,7 +60,7 @@ impl Default for TrainingConfig {
     fn default() -> Self {
         Self {
             seed: 0,
-            stages: vec![Stage { points: 1024, batch: 26, epochs: 500 }],
+            stages: vec![Stage { points: 1024, k: None, batch: 26, epochs: 500 }],
             learning_rate: 1e-3,
             decay: Decay::Steps,
             warmup_steps: 0,
@@ -72,9 +76,9 @@ impl TrainingConfig {
     pub fn quick() -> Self {
         Self {
             stages: vec![
-                Stage { points: 256, batch: 26, epochs: 60 },
-                Stage { points: 512, batch: 26, epochs: 8 },
-                Stage { points: 1024, batch: 26, epochs: 3 },
+                Stage { points: 256, k: Some(8), batch: 26, epochs: 60 },
+                Stage { points: 512, k: Some(14), batch: 26, epochs: 8 },
+                Stage { points: 1024, k: None, batch: 26, epochs: 3 },
             ],
             learning_rate: 2e-3,
             decay: Decay::Cosine,

@@ -15,7 +15,7 @@ use super::config::{Mixture, Stage, TrainingConfig};
 use super::history::{Event, History, ValidationErrors, Watcher};
 use crate::data::Shapes;
 use crate::data::loader::{Example, Loader, Plan, Position, Training};
-use crate::eval::metrics::{PoseErrors, recall};
+use crate::eval::metrics::{PoseErrors, Recall, Tolerance};
 use crate::models::weights::{store, TensorFile};
 use crate::models::{CloudInput, Clouds, Statistics, Upcr, init};
 use crate::random;
@@ -30,9 +30,8 @@ const EVENT_EVERY: Duration = Duration::from_secs(10);
 const LOADER_THREADS: usize = 1;
 /// The file in a run's folder with which it goes on.
 const CHECKPOINT: &str = "checkpoint.safetensors";
-/// A pose is right within these (protocols: objects in the unit sphere).
-const MAX_ROTATION_DEG: f64 = 5.0;
-const MAX_TRANSLATION: f64 = 0.2;
+/// Diameter of shapes in the unit sphere.
+const DIAMETER: f64 = 2.0;
 
 /// A training run.
 pub struct Trainer {
@@ -94,7 +93,7 @@ pub fn validate(network: &Upcr, validation: &Validation) -> ValidationErrors {
         loss: losses.iter().sum::<f64>() / losses.len().max(1) as f64,
         mae_r_deg: errors.euler_mae_deg,
         mae_t: errors.translation_mae,
-        recall: recall(&poses, MAX_ROTATION_DEG, MAX_TRANSLATION),
+        recall: Recall::of(&poses, |_| Tolerance::object(DIAMETER)).share(),
     }
 }
 
@@ -186,7 +185,8 @@ impl Trainer {
                     .map(|(stage, steps)| steps * 2 * stage.batch as u64)
                     .sum();
                 let place = Place { index, stage, first: before, end, steps, later };
-                let validation = Validation::new(held_out, mixture, stage.points, &config.network)?;
+                let seen = stage.network(&config.network);
+                let validation = Validation::new(held_out, mixture, stage.points, &seen)?;
                 if !self.stage(shapes, &validation, mixture, &place, watcher)? {
                     self.save()?;
                     return Ok(false);
@@ -215,9 +215,10 @@ impl Trainer {
             seed: random::fnv1a(&format!("{} stage {}", config.seed, place.index)),
             from: Position { epoch: done / per_epoch, batch: done % per_epoch },
         });
-        let network_config = config.network.clone();
+        let seen = place.stage.network(&config.network);
+        let k = seen.k;
         let prepare = move |example: &Example| {
-            let cloud = |points| CloudInput::new(points, &network_config);
+            let cloud = |points| CloudInput::new(points, &seen);
             Ok((cloud(&example.source)?, cloud(&example.target)?))
         };
         let mut batches = Loader::start(shapes, &plan, place.stage.batch, LOADER_THREADS, prepare)?;
@@ -226,7 +227,7 @@ impl Trainer {
         while self.state.step < place.end {
             let start = Instant::now();
             let Some(batch) = batches.next().transpose()? else { break };
-            let clouds = Clouds::new(&batch.prepared, config.network.k);
+            let clouds = Clouds::new(&batch.prepared, k);
             let rate = config.step_size(self.state.step, place.steps);
             let loss = self.step(&clouds, rate)?;
             self.state.step += 1;
@@ -318,6 +319,11 @@ struct Place<'a> {
 }
 
 impl Stage {
+    /// The network's configuration as its inputs see it.
+    fn network(&self, config: &NetworkConfig) -> NetworkConfig {
+        NetworkConfig { k: self.k.unwrap_or(config.k), ..config.clone() }
+    }
+
     fn steps_per_epoch(&self, shapes: usize) -> u64 {
         (shapes / self.batch).max(1) as u64
     }
