@@ -1,4 +1,4 @@
-//! The network against a plain form of it in PyTorch; `golden/README.md` says how its values were made.
+//! The network against a plain form of it in another framework; `golden/README.md` says how its values were made.
 
 #![allow(clippy::unwrap_used)]
 
@@ -55,7 +55,8 @@ fn poses_are_those_of_the_plain_network() {
         let bytes = bytes(file);
         let golden = SafeTensors::deserialize(&bytes).unwrap();
         let network = Network::from_safetensors(&bytes).unwrap();
-        let (rotations, translations) = (values(&golden, "eval.rotation"), values(&golden, "eval.translation"));
+        let (rotations, translations) =
+            (values(&golden, "eval.rotation"), values(&golden, "eval.translation"));
         for pair in 0..2 {
             let [source, target] = ["source", "target"].map(|role| cloud(&golden, &format!("{role}.{pair}")));
             let pose = network.predict(&source, &target).unwrap();

@@ -1,4 +1,4 @@
-//! The pose head: from the pose-related representation to a pose (eq. 6).
+//! The pose head: from the pose-related representation to a pose (section II-A).
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -45,7 +45,9 @@ impl Head {
                 }
             }
             if i + 1 < self.layers.len() {
-                room.iter_mut().for_each(|v| *v = leaky(*v, self.slope));
+                for value in room.iter_mut() {
+                    *value = leaky(*value, self.slope);
+                }
             }
             std::mem::swap(values, room);
         }
@@ -74,4 +76,42 @@ pub(super) fn to_rotation(kind: RotationKind, values: &[f32]) -> Matrix3<f64> {
         }
     };
     rotation.unwrap_or_else(Matrix3::identity)
+}
+
+#[cfg(test)]
+mod tests {
+    use safetensors::SafeTensors;
+
+    use super::*;
+
+    #[test]
+    fn rotations_are_those_of_the_plain_network() {
+        let bytes = include_bytes!("../../tests/golden/upcr_network.safetensors");
+        let golden = SafeTensors::deserialize(bytes).unwrap();
+        let values = |name: &str| -> Vec<f32> {
+            let data = golden.tensor(name).unwrap().data();
+            data.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect()
+        };
+        for (kind, name) in [
+            (RotationKind::Euler, "euler"),
+            (RotationKind::Quaternion, "quaternion"),
+            (RotationKind::SixD, "six_d"),
+            (RotationKind::Matrix, "matrix"),
+        ] {
+            let (inputs, rotations) =
+                (values(&format!("rotation.{name}.values")), values(&format!("rotation.{name}.R")));
+            for (inputs, rows) in inputs.chunks_exact(kind.values()).zip(rotations.chunks_exact(9)) {
+                let expected = Matrix3::from_fn(|r, c| f64::from(rows[3 * r + c]));
+                let found = to_rotation(kind, inputs);
+                assert!((found - expected).amax() < 1e-6, "{name}: {found} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn values_that_determine_no_rotation_give_the_identity() {
+        let nothing = [-1.0, 0.0, 0.0, 0.0, -1.0, 0.0];
+        assert_eq!(to_rotation(RotationKind::Quaternion, &nothing[..4]), Matrix3::identity());
+        assert_eq!(to_rotation(RotationKind::SixD, &nothing), Matrix3::identity());
+    }
 }

@@ -20,13 +20,13 @@ pub(super) fn whole_tiles(points: usize) -> usize {
 /// `out[i] = init + Σₖ rows[i·stride + k] · panel[k]`, for whole tiles of rows.
 #[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 pub(super) fn multiply(rows: &[f32], stride: usize, panel: &[Lanes], init: &Lanes, out: &mut [Lanes]) {
+    const WIDE: bool = target_cfg_f!(target_feature = "avx512f");
+    const FUSED: bool = target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"));
     // As many accumulators as the registers hold: two vectors for each row of a tile.
-    if target_cfg_f!(target_feature = "avx512f") {
-        multiply_by::<32, true>(rows, stride, panel, init, out);
-    } else if target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
-        multiply_by::<16, true>(rows, stride, panel, init, out);
-    } else {
-        multiply_by::<8, false>(rows, stride, panel, init, out);
+    match (WIDE, FUSED) {
+        (true, _) => multiply_by::<32, true>(rows, stride, panel, init, out),
+        (_, true) => multiply_by::<16, true>(rows, stride, panel, init, out),
+        _ => multiply_by::<8, false>(rows, stride, panel, init, out),
     }
 }
 
@@ -132,11 +132,8 @@ pub(super) fn embed(
     out: &mut [f32],
     stride: usize,
 ) {
-    if target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64")) {
-        embed_by::<true>(edges, weights, neighbor, graph, slope, out, stride);
-    } else {
-        embed_by::<false>(edges, weights, neighbor, graph, slope, out, stride);
-    }
+    const FUSED: bool = target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"));
+    embed_by::<FUSED>(edges, weights, neighbor, graph, slope, out, stride);
 }
 
 #[inline(always)]

@@ -1,4 +1,4 @@
-//! Graph layers without an edge tensor (eq. 2).
+//! Graph layers without an edge tensor (equation 2).
 //!
 //! A layer's map over the edge i → j, `Wᵀ[Fᵢ ; Fⱼ − Fᵢ]`, is `(W₁ − W₂)ᵀFᵢ + W₂ᵀFⱼ`: two products a point, not one an
 //! edge. Batch norm with a positive scale and the leaky rectifier grow with their argument, so the maximum over the
@@ -141,7 +141,7 @@ impl Embedding {
         Self { slope, blocks }
     }
 
-    /// Φ⁰ (eq. 4).
+    /// Φ⁰ (equation 4).
     pub fn apply(
         &self,
         inputs: &InvariantInputs,
@@ -179,4 +179,3 @@ impl Channels {
         std::array::from_fn(|l| values.get(self.0 + l).copied().unwrap_or(0.0))
     }
 }
-

@@ -37,11 +37,11 @@ struct InvariantBranch {
 pub struct Representations {
     /// Mean of the points.
     pub centroid: [f64; 3],
-    /// Γ_G, of positions.
+    /// Γg, of positions.
     pub global: Vec<f32>,
-    /// Γ_ν, of what no motion changes; Γ_G where the network has no such branch.
+    /// Γν, of what no motion changes; Γg where the network has no such branch.
     pub invariant: Vec<f32>,
-    /// Γ_μ, what remains of the first without the second (eq. 5).
+    /// Γμ, what remains of the first without the second (section II-A).
     pub pose: Vec<f32>,
     /// What the pose head reads from it: values of a rotation, then three of a translation.
     pub head: Vec<f32>,
@@ -107,7 +107,7 @@ impl Network {
         self.trained
     }
 
-    /// The pose that lays `source` on `target` (eq. 7), the two clouds and their branches in parallel. The clouds are
+    /// The pose that lays `source` on `target`, the two clouds and their branches in parallel. The clouds are
     /// meant to be as in training: of that scale, and not much denser.
     ///
     /// # Errors
@@ -218,7 +218,7 @@ impl Network {
         }
     }
 
-    /// Γ_μ = m·p·log(p/q) with q = softmax(Γ_G), p = softmax(Γ_ν) (eq. 5).
+    /// Γμ = m·p·log(p/q) with q = softmax(Γg), p = softmax(Γν) (section II-A).
     fn separate(&self, r: &mut Representations) {
         r.pose.clear();
         if self.invariant.is_none() {
@@ -301,7 +301,7 @@ struct BranchRoom {
 
 /// Rooms that passes leave for later ones, so that no memory is allocated once as many are there as run at a time.
 #[derive(Debug, Clone, Default)]
-struct Rooms(Arc<Mutex<Vec<Box<Room>>>>);
+struct Rooms(Arc<Mutex<Vec<Room>>>);
 
 impl Rooms {
     fn with<T>(&self, work: impl FnOnce(&mut Room) -> T) -> T {

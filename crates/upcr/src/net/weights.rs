@@ -40,7 +40,8 @@ impl<'a> Weights<'a> {
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(unreadable)?;
         let tensors = SafeTensors::deserialize(bytes).map_err(unreadable)?;
         let entry = |key| header.metadata().as_ref().and_then(|entries| entries.get(key));
-        let config = entry(CONFIG_KEY).ok_or_else(|| invalid(format!("no `{CONFIG_KEY}` in its metadata")))?;
+        let config =
+            entry(CONFIG_KEY).ok_or_else(|| invalid(format!("no `{CONFIG_KEY}` in its metadata")))?;
         let config: NetworkConfig =
             serde_json::from_str(config).map_err(|e| invalid(format!("`{CONFIG_KEY}`: {e}")))?;
         config.check()?;
