@@ -84,6 +84,12 @@ pub enum Error {
         /// In which way.
         reason: &'static str,
     },
+    /// A network's weights are not what its configuration demands.
+    #[error("network weights: {reason}")]
+    InvalidWeights {
+        /// What is wrong, and with which tensor.
+        reason: String,
+    },
     /// A setting is out of its range, or two settings contradict each other.
     #[error("setting `{name}`: {reason}")]
     InvalidSetting {

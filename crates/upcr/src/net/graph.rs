@@ -50,6 +50,12 @@ impl Graph {
     pub fn row(&self, i: usize) -> &[u32] {
         &self.neighbors[i * self.k..(i + 1) * self.k]
     }
+
+    /// Every point's neighbours.
+    #[inline(always)]
+    pub(super) fn rows(&self) -> std::slice::ChunksExact<'_, u32> {
+        self.neighbors.chunks_exact(self.k.max(1))
+    }
 }
 
 /// A k-nearest search gives rows of one length.

@@ -1,9 +1,16 @@
-//! The UPCR network: what it is made of and what goes into it.
+//! The UPCR network (sections II-A and II-B of the paper): what it is made of, and its inference.
 
 mod config;
 mod graph;
+mod head;
 mod invariant;
+mod kernel;
+mod layer;
+mod network;
+mod search;
+mod weights;
 
 pub use config::{GraphKind, NetworkConfig, RotationKind};
 pub use graph::Graph;
 pub use invariant::{Invariant, InvariantInputs};
+pub use network::{Network, Representations};

@@ -1,0 +1,313 @@
+//! The forward pass of a trained network.
+
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use nalgebra::Vector3;
+
+use super::head::Head;
+use super::layer::{Embedding, Features, GraphLayer, Products};
+use super::search::{SearchRoom, nearest, nearest_features};
+use super::weights::Weights;
+use super::{Graph, GraphKind, Invariant, InvariantInputs, NetworkConfig};
+use crate::error::{CloudRole, Error, Result};
+use crate::neighbors::KdTree;
+use crate::transform::Rigid;
+
+/// A trained UPCR network, packed for inference.
+#[derive(Debug, Clone)]
+pub struct Network {
+    config: NetworkConfig,
+    trained: bool,
+    global: Vec<GraphLayer>,
+    invariant: Option<InvariantBranch>,
+    head: Head,
+    rooms: Rooms,
+}
+
+/// The branch that sees φ alone.
+#[derive(Debug, Clone)]
+struct InvariantBranch {
+    embedding: Embedding,
+    layers: Vec<GraphLayer>,
+}
+
+/// What a network makes of one cloud.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Representations {
+    /// Mean of the points.
+    pub centroid: [f64; 3],
+    /// Γg, of positions.
+    pub global: Vec<f32>,
+    /// Γν, of what no motion changes; Γg where the network has no such branch.
+    pub invariant: Vec<f32>,
+    /// Γμ, what remains of the first without the second (section II-A).
+    pub pose: Vec<f32>,
+    /// What the pose head reads from it: values of a rotation, then three of a translation.
+    pub head: Vec<f32>,
+}
+
+impl Network {
+    /// From a weights file's bytes.
+    ///
+    /// # Errors
+    /// [`Error::InvalidWeights`] where they are no weights file, or a tensor is missing, of another shape or type, or
+    /// not finite; [`Error::InvalidSetting`] where the configuration is out of its range.
+    pub fn from_safetensors(bytes: &[u8]) -> Result<Self> {
+        let weights = Weights::open(bytes)?;
+        let config = weights.config.clone();
+        let slope = config.negative_slope;
+        let layers = |branch: &str, inputs: usize| {
+            let inputs = std::iter::once(inputs).chain(config.widths.iter().copied());
+            let layer = |(l, (inputs, &outputs))| {
+                Ok(GraphLayer::new(&weights.edge_map(&format!("{branch}.{l}"), 2 * inputs, outputs)?, slope))
+            };
+            inputs.zip(&config.widths).enumerate().map(layer).collect::<Result<Vec<_>>>()
+        };
+        let global = layers("global", 3)?;
+        let mut invariant = None;
+        if config.invariant != Invariant::None {
+            let (edge_dim, point_dim) = (config.invariant.edge_dim(), config.invariant.point_dim());
+            let map = weights.edge_map("invariant.embed", edge_dim + point_dim, config.widths[0])?;
+            let embedding = Embedding::new(&map, edge_dim, slope);
+            invariant = Some(InvariantBranch { embedding, layers: layers("invariant", config.widths[0])? });
+        }
+        let values = config.rotation.values() + 3;
+        let inputs = std::iter::once(config.representation()).chain(config.head.iter().copied());
+        let outputs = config.head.iter().copied().chain(std::iter::once(values));
+        let head = inputs.zip(outputs).enumerate();
+        let head = head.map(|(i, (inputs, outputs))| weights.linear(&format!("head.{i}"), inputs, outputs));
+        let head = Head::new(head.collect::<Result<Vec<_>>>()?, slope, config.rotation);
+        Ok(Self { trained: weights.trained, config, global, invariant, head, rooms: Rooms::default() })
+    }
+
+    /// From a weights file.
+    ///
+    /// # Errors
+    /// [`Error::Io`] where it cannot be read; otherwise as [`Self::from_safetensors`], [`Error::Malformed`] in place of
+    /// [`Error::InvalidWeights`].
+    pub fn load(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let bytes = std::fs::read(path).map_err(|source| Error::Io { path: path.into(), source })?;
+        Self::from_safetensors(&bytes).map_err(|error| match error {
+            Error::InvalidWeights { reason } => {
+                Error::Malformed { path: path.into(), format: "weights", reason }
+            }
+            other => other,
+        })
+    }
+
+    /// What the network is made of.
+    pub fn config(&self) -> &NetworkConfig {
+        &self.config
+    }
+
+    /// Whether its weights were trained; random ones say so in their file.
+    pub fn is_trained(&self) -> bool {
+        self.trained
+    }
+
+    /// The pose that lays `source` on `target`, the two clouds and their branches in parallel. The clouds are
+    /// meant to be as in training: of that scale, and not much denser.
+    ///
+    /// # Errors
+    /// Where a cloud is empty or holds a coordinate that is not finite.
+    pub fn predict(&self, source: &[[f32; 3]], target: &[[f32; 3]]) -> Result<Rigid> {
+        let (source, target) =
+            rayon::join(|| self.pose(source, CloudRole::Source), || self.pose(target, CloudRole::Target));
+        Ok(target? * source?.inverse())
+    }
+
+    /// Every cloud's representations.
+    ///
+    /// # Errors
+    /// Where the cloud is empty or holds a coordinate that is not finite.
+    pub fn representations(&self, cloud: &[[f32; 3]]) -> Result<Representations> {
+        self.rooms.with(|room| {
+            self.run(cloud, CloudRole::Cloud, room)?;
+            Ok(room.representations.clone())
+        })
+    }
+
+    /// The pose of a cloud about the latent canonical shape.
+    fn pose(&self, cloud: &[[f32; 3]], role: CloudRole) -> Result<Rigid> {
+        self.rooms.with(|room| {
+            self.run(cloud, role, room)?;
+            let Representations { centroid, head, .. } = &room.representations;
+            let about_centroid = self.head.pose(head);
+            let translation = Vector3::from(*centroid) + about_centroid.translation;
+            Ok(Rigid { translation, ..about_centroid })
+        })
+    }
+
+    /// Fills the room's representations.
+    fn run(&self, cloud: &[[f32; 3]], role: CloudRole, room: &mut Room) -> Result<()> {
+        check(cloud, role)?;
+        self.prepare(cloud, room)?;
+        let Room { representations, points, order, graph, inputs, global, invariant, values, .. } = room;
+        let (global_gamma, invariant_gamma) = (&mut representations.global, &mut representations.invariant);
+        rayon::join(
+            || {
+                global.features.copy_from(points.as_flattened(), 3);
+                self.branch(&self.global, 3, graph, order, global, global_gamma);
+            },
+            || {
+                if let Some(InvariantBranch { embedding, layers }) = &self.invariant {
+                    let BranchRoom { features, next, products, .. } = invariant;
+                    embedding.apply(inputs, graph, next, products, features);
+                    let channels = self.config.widths[0];
+                    self.branch(layers, channels, graph, order, invariant, invariant_gamma);
+                }
+            },
+        );
+        self.separate(representations);
+        self.head.apply(&representations.pose, &mut representations.head, values);
+        Ok(())
+    }
+
+    /// Moves the cloud to its centroid and finds neighbours and φ.
+    fn prepare(&self, cloud: &[[f32; 3]], room: &mut Room) -> Result<()> {
+        let Room { representations, points, order, graph, inputs, search, .. } = room;
+        let o = centroid(cloud);
+        representations.centroid = o;
+        points.clear();
+        points.extend(cloud.iter().map(|p| [0, 1, 2].map(|a| (f64::from(p[a]) - o[a]) as f32)));
+        match self.config.invariant {
+            Invariant::None => nearest(points, self.config.k, order, graph, search),
+            Invariant::Distance => {
+                nearest(points, self.config.k, order, graph, search);
+                distances(points, graph, inputs);
+            }
+            other => {
+                let neighborhoods = KdTree::new(points).knn_graph(self.config.k);
+                *inputs = other.inputs(points, &neighborhoods)?;
+                *graph = Graph::from(&neighborhoods);
+                order.clear();
+                order.extend(0..points.len() as u32);
+            }
+        }
+        Ok(())
+    }
+
+    /// A branch's representation from the features that lie ready in `room`.
+    fn branch(
+        &self,
+        layers: &[GraphLayer],
+        mut channels: usize,
+        graph: &Graph,
+        order: &[u32],
+        room: &mut BranchRoom,
+        gamma: &mut Vec<f32>,
+    ) {
+        let BranchRoom { features, next, products, search, .. } = room;
+        for (l, (layer, &outputs)) in layers.iter().zip(&self.config.widths).enumerate() {
+            let graph = match self.config.graph {
+                GraphKind::Static => graph,
+                GraphKind::Dynamic => {
+                    nearest_features(features, channels, self.config.k, order, &mut room.graph, search);
+                    &room.graph
+                }
+            };
+            if l + 1 < layers.len() {
+                layer.apply(features, graph, products, next);
+                std::mem::swap(features, next);
+            } else {
+                layer.pool(features, graph, products, gamma);
+            }
+            channels = outputs;
+        }
+    }
+
+    /// Γμ = m·p·log(p/q) with q = softmax(Γg), p = softmax(Γν) (section II-A).
+    fn separate(&self, r: &mut Representations) {
+        r.pose.clear();
+        if self.invariant.is_none() {
+            r.invariant.clone_from(&r.global);
+            r.pose.extend_from_slice(&r.global);
+            return;
+        }
+        let (log_q, log_p) = (log_normalizer(&r.global), log_normalizer(&r.invariant));
+        let m = r.global.len() as f32;
+        r.pose.extend(r.global.iter().zip(&r.invariant).map(|(g, v)| {
+            let (log_q, log_p) = (g - log_q, v - log_p);
+            m * log_p.exp() * (log_p - log_q)
+        }));
+    }
+}
+
+/// log Σ exp
+fn log_normalizer(values: &[f32]) -> f32 {
+    let most = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    most + values.iter().map(|v| (v - most).exp()).sum::<f32>().ln()
+}
+
+fn check(cloud: &[[f32; 3]], role: CloudRole) -> Result<()> {
+    if cloud.is_empty() {
+        return Err(Error::TooFewPoints { role, found: 0, needed: 1 });
+    }
+    let finite = |p: &[f32; 3]| p.iter().all(|v| v.is_finite());
+    match cloud.iter().position(|p| !finite(p)) {
+        Some(first) => {
+            Err(Error::NonFinite { role, count: cloud.iter().filter(|p| !finite(p)).count(), first })
+        }
+        None => Ok(()),
+    }
+}
+
+fn centroid(cloud: &[[f32; 3]]) -> [f64; 3] {
+    let sum = cloud.iter().fold([0.0; 3], |sum, p| [0, 1, 2].map(|a| sum[a] + f64::from(p[a])));
+    sum.map(|s| s / cloud.len() as f64)
+}
+
+/// φ of [`Invariant::Distance`] for points about their centroid, over rows in any order.
+fn distances(points: &[[f32; 3]], graph: &Graph, inputs: &mut InvariantInputs) {
+    let length = |v: [f32; 3]| (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+    inputs.edge_dim = 3;
+    inputs.edges.clear();
+    for (&center, row) in points.iter().zip(graph.rows()) {
+        let to_center = length(center);
+        inputs.edges.extend(row.iter().flat_map(|&j| {
+            let neighbor = points[j as usize];
+            let between = [0, 1, 2].map(|a| neighbor[a] - center[a]);
+            [length(neighbor), length(between), to_center]
+        }));
+    }
+}
+
+/// What the pass of one cloud needs room for.
+#[derive(Debug, Default)]
+struct Room {
+    /// Points about the centroid, near ones near each other, and the order that they came in.
+    points: Vec<[f32; 3]>,
+    order: Vec<u32>,
+    graph: Graph,
+    search: SearchRoom,
+    inputs: InvariantInputs,
+    global: BranchRoom,
+    invariant: BranchRoom,
+    representations: Representations,
+    values: Vec<f32>,
+}
+
+/// What a branch needs room for.
+#[derive(Debug, Default)]
+struct BranchRoom {
+    features: Features,
+    next: Features,
+    products: Products,
+    graph: Graph,
+    search: SearchRoom,
+}
+
+/// Rooms that passes leave for later ones, so that no memory is allocated once as many are there as run at a time.
+#[derive(Debug, Clone, Default)]
+struct Rooms(Arc<Mutex<Vec<Room>>>);
+
+impl Rooms {
+    fn with<T>(&self, work: impl FnOnce(&mut Room) -> T) -> T {
+        let mut room = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
+        let result = work(&mut room);
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(room);
+        result
+    }
+}
