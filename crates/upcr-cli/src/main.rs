@@ -1,6 +1,8 @@
 //! The command line of UPCR: parse, call, print.
 
+mod adapt;
 mod convert;
+//mod eval;
 mod features;
 mod info;
 mod input;
@@ -49,6 +51,8 @@ enum Command {
     Convert(convert::Args),
     Info(info::Args),
     Train(train::Args),
+    Adapt(adapt::Args),
+    //Eval(eval::Args),
 }
 
 fn main() -> ExitCode {
@@ -59,6 +63,8 @@ fn main() -> ExitCode {
         Command::Convert(args) => convert::run(&args),
         Command::Info(args) => info::run(&args),
         Command::Train(args) => train::run(&args),
+        Command::Adapt(args) => adapt::run(&args),
+        //Command::Eval(args) => eval::run(&args),
     };
     outcome.unwrap_or_else(|error| {
         output::note(&format!("error: {}", describe(&error)));

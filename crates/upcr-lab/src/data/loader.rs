@@ -38,10 +38,22 @@ pub struct Training {
     pub mixture: Vec<(Protocol, f64)>,
     /// Points of every cloud, instead of what the protocols say; partial clouds are cut from larger ones.
     pub points: usize,
+    /// Whether a shape's pair changes from epoch to epoch.
+    pub poses: Poses,
     /// Seed of the run.
     pub seed: u64,
     /// Where to start.
     pub from: Position,
+}
+
+/// Whether a shape's pair changes from epoch to epoch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Poses {
+    /// New points, poses and noise in every epoch.
+    #[default]
+    Fresh,
+    /// The protocol's own pair of the shape in every epoch, as evaluations have it.
+    Fixed,
 }
 
 /// A batch's place in a run. A `batch` beyond the epoch's end is one of later epochs.
@@ -216,7 +228,11 @@ impl Training {
         let Some((protocol, _)) = chosen.or(self.mixture.last()) else {
             return invalid("mixture", "is empty");
         };
-        protocol.keeping(self.points).random_pair(shape, rng)
+        let protocol = protocol.keeping(self.points);
+        match self.poses {
+            Poses::Fresh => protocol.random_pair(shape, rng),
+            Poses::Fixed => protocol.pair(shape, item as u64),
+        }
     }
 }
 
@@ -319,7 +335,7 @@ mod tests {
 
     fn training(from: Position) -> Plan {
         let mixture = vec![(Protocol::CONSISTENT, 3.0), (Protocol::PARTIAL_INDEPENDENT.noisy(), 1.0)];
-        Plan::Training(Training { mixture, points: 40, seed: 7, from })
+        Plan::Training(Training { mixture, points: 40, poses: Poses::Fresh, seed: 7, from })
     }
 
     fn take(shapes: &Arc<Shapes>, plan: &Plan, threads: usize, count: usize) -> Vec<PairBatch<[f32; 3]>> {
@@ -417,7 +433,7 @@ mod tests {
             Loader::start(&shapes, &plan, size, threads, |_| Ok(())).is_ok()
         };
         let mixed = |mixture, points| {
-            Plan::Training(Training { mixture, points, seed: 0, from: Position::default() })
+            Plan::Training(Training { mixture, points, poses: Poses::Fresh, seed: 0, from: Position::default() })
         };
         let good = || mixed(vec![(Protocol::CONSISTENT, 1.0)], 100);
         assert!(start(shapes(5), good(), 2, 1));

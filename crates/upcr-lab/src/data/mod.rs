@@ -100,6 +100,12 @@ impl Shapes {
         self.clouds[index].iter().map(|p| p.map(f64::from)).collect()
     }
 
+    /// Keeps the first `length` shapes.
+    pub fn truncate(&mut self, length: usize) {
+        self.clouds.truncate(length);
+        self.labels.truncate(length);
+    }
+
     /// Adds the shapes of another set, whose categories come after these.
     pub fn append(&mut self, other: Self) {
         let first = self.names.len() as u8;

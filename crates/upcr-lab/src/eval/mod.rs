@@ -1,3 +1,5 @@
-//! How estimated poses are judged.
+//! Evaluation of registrations: methods over protocols, and what their errors are.
 
+pub mod methods;
 pub mod metrics;
+pub mod run;

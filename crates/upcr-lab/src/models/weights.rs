@@ -1,6 +1,6 @@
 //! A network's weights as safetensors, in the layout that the product library reads.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use burn::module::Param;
@@ -22,7 +22,7 @@ pub struct TensorFile {
     /// By name.
     pub tensors: BTreeMap<String, StoredTensor>,
     /// Free texts by key.
-    pub metadata: HashMap<String, String>,
+    pub metadata: BTreeMap<String, String>,
 }
 
 /// A tensor in a file.
@@ -65,7 +65,9 @@ impl TensorFile {
                 StoredTensor { dtype: view.dtype(), shape: view.shape().to_vec(), bytes: view.data().to_vec() };
             (name.to_owned(), stored)
         });
-        Ok(Self { tensors: tensors.collect(), metadata: header.metadata().clone().unwrap_or_default() })
+        let metadata = header.metadata().iter().flatten();
+        let metadata = metadata.map(|(key, text)| (key.clone(), text.clone())).collect();
+        Ok(Self { tensors: tensors.collect(), metadata })
     }
 
     /// The bytes of a file with these tensors.
@@ -82,7 +84,8 @@ impl TensorFile {
             .iter()
             .map(|(name, t)| Ok((name, TensorView::new(t.dtype, t.shape.clone(), &t.bytes).map_err(failed)?)))
             .collect::<Result<Vec<_>>>()?;
-        safetensors::serialize(views, Some(self.metadata.clone())).map_err(failed)
+        let metadata = self.metadata.iter().map(|(key, text)| (key.clone(), text.clone())).collect();
+        safetensors::serialize(views, Some(metadata)).map_err(failed)
     }
 }
 

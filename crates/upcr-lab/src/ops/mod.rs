@@ -16,3 +16,6 @@ mod product;
 
 pub use batch::BatchGraph;
 pub use extension::{Normalized, NormalizedMap, canonical_chamfer, edge_embed, graph_layer, pool_max};
+
+#[cfg(test)]
+mod tests;

@@ -1,11 +1,13 @@
 //! Training without labels: the loop, what it keeps, and how it goes on after a stop.
 
+mod adapt;
 mod checkpoint;
 mod config;
 mod history;
 mod trainer;
 
+pub use adapt::{Adaptation, adapt};
 pub use checkpoint::write_atomically;
 pub use config::{Decay, Mixture, Stage, TrainingConfig};
-pub use history::{Event, History, Silent, Watcher};
-pub use trainer::{Trainer, Validation, validate};
+pub use history::{Event, History, Silent, ValidationErrors, Watcher};
+pub use trainer::{Poses, Trainer, Validation, validate};

@@ -14,6 +14,7 @@ use super::checkpoint::{self, State};
 use super::config::{Mixture, Stage, TrainingConfig};
 use super::history::{Event, History, ValidationErrors, Watcher};
 use crate::data::Shapes;
+pub use crate::data::loader::Poses;
 use crate::data::loader::{Example, Loader, Plan, Position, Training};
 use crate::eval::metrics::{PoseErrors, Recall, Tolerance};
 use crate::models::weights::{store, TensorFile};
@@ -156,9 +157,8 @@ impl Trainer {
     /// # Errors
     /// Where a shape has too few points, a file cannot be written, or the loss is no longer finite.
     pub fn run(&mut self, shapes: &Shapes, mixture: &Mixture, watcher: &mut dyn Watcher) -> Result<bool> {
-        let config = self.state.config.clone();
-        let (learned, held_out) = shapes.split_every_nth(config.validation_every_nth);
-        self.run_on(&Arc::new(learned), &held_out, mixture, watcher)
+        let (learned, held_out) = shapes.split_every_nth(self.state.config.validation_every_nth);
+        self.run_on(&Arc::new(learned), &held_out, mixture, Poses::Fresh, watcher)
     }
 
     /// The same with given sets.
@@ -170,6 +170,7 @@ impl Trainer {
         shapes: &Arc<Shapes>,
         held_out: &Shapes,
         mixture: &Mixture,
+        poses: Poses,
         watcher: &mut dyn Watcher,
     ) -> Result<bool> {
         let config = self.state.config.clone();
@@ -184,7 +185,7 @@ impl Trainer {
                     .zip(&lengths[index + 1..])
                     .map(|(stage, steps)| steps * 2 * stage.batch as u64)
                     .sum();
-                let place = Place { index, stage, first: before, end, steps, later };
+                let place = Place { index, stage, poses, first: before, end, steps, later };
                 let seen = stage.network(&config.network);
                 let validation = Validation::new(held_out, mixture, stage.points, &seen)?;
                 if !self.stage(shapes, &validation, mixture, &place, watcher)? {
@@ -212,6 +213,7 @@ impl Trainer {
         let plan = Plan::Training(Training {
             mixture: mixture.clone(),
             points: place.stage.points,
+            poses: place.poses,
             seed: random::fnv1a(&format!("{} stage {}", config.seed, place.index)),
             from: Position { epoch: done / per_epoch, batch: done % per_epoch },
         });
@@ -310,6 +312,7 @@ impl Default for Since {
 struct Place<'a> {
     index: usize,
     stage: &'a Stage,
+    poses: Poses,
     /// Steps of the run before it and to its end, and of the whole run.
     first: u64,
     end: u64,

@@ -1,0 +1,129 @@
+//! `upcr adapt`: learned weights learn on from the clouds at hand, without labels.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use clap::ValueEnum;
+use upcr_lab::data::{self, Split, pairs};
+use upcr_lab::models::weights::{TensorFile, restore, store};
+use upcr_lab::train::{Poses, TrainingConfig, adapt, write_atomically};
+
+use crate::output;
+use crate::train::{Backend, Pairs, Teller};
+
+const AFTER_HELP: &str = "\
+Files in the output folder:
+  weights.safetensors      the adapted weights, or the old ones where adapting did not help
+  adaptation.json          loss before and after, settings, seed and version
+  checkpoint.safetensors   the state of the run, written every minute";
+
+/// Let learned weights learn on from your own clouds, without labels
+#[derive(clap::Args)]
+#[command(after_help = AFTER_HELP)]
+pub struct Args {
+    /// Weights to start from
+    #[arg(long, value_name = "FILE")]
+    weights: PathBuf,
+    /// Folder of clouds, or a data set
+    #[arg(long, value_name = "PATH")]
+    clouds: PathBuf,
+    /// Part of a data set; a folder of clouds is taken whole
+    #[arg(long, value_enum, default_value_t = Part::All)]
+    split: Part,
+    /// Pairs that are made of the clouds
+    #[arg(long, value_enum, default_value_t = Pairs::Mixed)]
+    protocol: Pairs,
+    /// Keep three quarters of each cloud
+    #[arg(long)]
+    partial: bool,
+    /// Learn from the one pair of each cloud that `upcr eval` has, not from new poses in every epoch
+    #[arg(long)]
+    fixed_pairs: bool,
+    /// Passes over the clouds
+    #[arg(long, value_name = "N", default_value_t = 200)]
+    epochs: u64,
+    /// Points of a cloud
+    #[arg(long, value_name = "N", default_value_t = pairs::POINTS)]
+    points: usize,
+    /// Adam's step size at the start
+    #[arg(long, value_name = "SIZE", default_value_t = 1e-4)]
+    learning_rate: f64,
+    /// Seed of the pairs
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Threads to use [default: all]; the result does not depend on it
+    #[arg(long, value_name = "N")]
+    threads: Option<std::num::NonZeroUsize>,
+    /// What computes
+    #[arg(long, value_enum, default_value_t = Backend::Cpu)]
+    backend: Backend,
+    /// Folder for the results; made where missing
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+/// Part of a data set.
+#[derive(Clone, Copy, ValueEnum)]
+pub enum Part {
+    /// What training sees
+    Train,
+    /// What it does not
+    Test,
+    /// Both
+    All,
+}
+
+impl From<Part> for Split {
+    fn from(part: Part) -> Self {
+        match part {
+            Part::Train => Self::Train,
+            Part::Test => Self::Test,
+            Part::All => Self::All,
+        }
+    }
+}
+
+pub fn run(args: &Args) -> Result<ExitCode> {
+    output::on_threads(args.threads, || learn(args))?
+}
+
+fn learn(args: &Args) -> Result<ExitCode> {
+    let bytes = std::fs::read(&args.weights).with_context(|| args.weights.display().to_string())?;
+    let file = TensorFile::from_bytes(&bytes, &args.weights)?;
+    let network = restore(&file, &args.weights, &args.backend.device().autodiff())?;
+    let shapes = Arc::new(data::open(&args.clouds, args.split.into())?);
+    output::note(&format!("{} clouds to learn from", shapes.len()));
+    std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
+    let mut config = TrainingConfig::adaptation(&network, args.points, args.epochs);
+    config.learning_rate = args.learning_rate;
+    config.seed = args.seed;
+    let mixture = args.protocol.mixture(args.partial);
+    let poses = if args.fixed_pairs { Poses::Fixed } else { Poses::Fresh };
+    let mut teller = Teller::new()?;
+    let done = adapt(&network, &shapes, &mixture, poses, config.clone(), &args.out, &mut teller)?;
+    let path = args.out.join("weights.safetensors");
+    write_atomically(&path, &store(&done.network).to_bytes()?)?;
+    let [before, after] = done.errors;
+    let report = serde_json::json!({
+        "before": before,
+        "after": after,
+        "helped": done.helped,
+        "finished": done.finished,
+        "clouds": args.clouds,
+        "weights": args.weights,
+        "version": env!("CARGO_PKG_VERSION"),
+        "training": config,
+    });
+    let report = serde_json::to_string_pretty(&report)?;
+    write_atomically(&args.out.join("adaptation.json"), report.as_bytes())?;
+    output::note(&format!(
+        "loss {:.6} before, {:.6} after: {}",
+        before.loss,
+        after.loss,
+        if done.helped { "the adapted weights are kept" } else { "no better, the old weights are kept" }
+    ));
+    output::answer(&format!("{}\n", path.display()))?;
+    Ok(ExitCode::SUCCESS)
+}

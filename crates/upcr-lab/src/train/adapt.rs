@@ -1,0 +1,63 @@
+//! Label-free adaptation: a learned network learns on from the clouds at hand (section III, fine-tuning).
+
+use std::path::Path;
+use std::sync::Arc;
+
+use upcr::Result;
+
+use super::config::{Decay, Mixture, Stage, TrainingConfig};
+use super::history::{ValidationErrors, Watcher};
+use super::trainer::{Poses, Trainer, Validation, validate};
+use crate::data::Shapes;
+use crate::models::Upcr;
+
+/// What came of an adaptation.
+#[derive(Debug)]
+pub struct Adaptation {
+    /// The better network: the adapted one, or the old one where its loss is not lower.
+    pub network: Upcr,
+    /// Whether the network is the adapted one.
+    pub helped: bool,
+    /// On the clouds' own pairs before, and after.
+    pub errors: [ValidationErrors; 2],
+    /// Whether the run came to its end; stopped early, what had been learned until then counts.
+    pub finished: bool,
+}
+
+impl TrainingConfig {
+    /// The paper's fine-tuning: 200 epochs from a step size of 1e-4, on clouds of so many points.
+    pub fn adaptation(network: &Upcr, points: usize, epochs: u64) -> Self {
+        Self {
+            stages: vec![Stage { points, k: None, batch: 26, epochs }],
+            learning_rate: 1e-4,
+            decay: Decay::Cosine,
+            validation_epochs: (epochs / 20).max(1),
+            network: network.config.clone(),
+            ..Self::default()
+        }
+    }
+}
+
+/// Learns on from all of `shapes` without labels. The run's checkpoint comes to `folder`.
+///
+/// # Errors
+/// As [`Trainer::run`].
+pub fn adapt(
+    network: &Upcr,
+    shapes: &Arc<Shapes>,
+    mixture: &Mixture,
+    poses: Poses,
+    config: TrainingConfig,
+    folder: &Path,
+    watcher: &mut dyn Watcher,
+) -> Result<Adaptation> {
+    let points = config.stages.last().map_or(crate::data::pairs::POINTS, |stage| stage.points);
+    let validation = Validation::new(shapes, mixture, points, &network.config)?;
+    let before = validate(network, &validation);
+    let mut trainer = Trainer::from_network(config, network.clone(), folder)?;
+    let finished = trainer.run_on(shapes, shapes, mixture, poses, watcher)?;
+    let after = validate(trainer.network(), &validation);
+    let helped = after.loss < before.loss;
+    let network = if helped { trainer.network() } else { network }.clone();
+    Ok(Adaptation { network, helped, errors: [before, after], finished })
+}
