@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use upcr_lab::data::pairs::Protocol;
 use upcr_lab::data::{self, Half, Shapes, Split};
 use upcr_lab::train::{
-    Event, Mixture, Trainer, TrainingConfig, Watcher, write_atomically,
+    Event, Mixture, Trainer, TrainingConfig, Watcher, write_atomically, write_history,
 };
 
 use crate::output;
@@ -170,7 +170,7 @@ fn train(args: &Args) -> Result<ExitCode> {
     output::note(&format!("{} shapes to learn from", shapes.len()));
     let mixture = run.protocol.mixture(run.partial);
     let done = trainer.run(&shapes, &mixture, &mut Teller::new()?)?;
-    write_history(&folder, &trainer)?;
+    write_history(&folder, trainer.history())?;
     if !done {
         output::note(&format!("stopped; go on with: upcr train --resume {}", folder.display()));
         return Ok(ExitCode::SUCCESS);
@@ -206,22 +206,6 @@ fn start(args: &Args, device: &upcr_lab::Device) -> Result<(PathBuf, Run, Traine
     };
     write_atomically(&folder.join("run.toml"), toml::to_string_pretty(&run)?.as_bytes())?;
     Ok((folder, run, trainer))
-}
-
-/// The learning curve as a table and as a plot.
-pub fn write_history(folder: &Path, trainer: &Trainer) -> Result<()> {
-    let mut csv =
-        String::from("step,points,seconds,learning_rate,clouds_per_second,loss,val_loss,val_mae_r_deg,val_mae_t,val_recall\n");
-    for e in trainer.history() {
-        let numbers = e.validation.map_or([f64::NAN; 4], |v| [v.loss, v.mae_r_deg, v.mae_t, v.recall]);
-        let numbers: Vec<String> = numbers.iter().map(f64::to_string).collect();
-        csv.push_str(&format!(
-            "{},{},{:.1},{:e},{:.1},{},{}\n",
-            e.step, e.points, e.seconds, e.learning_rate, e.clouds_per_second, e.loss, numbers.join(",")
-        ));
-    }
-    write_atomically(&folder.join("history.csv"), csv.as_bytes())?;
-    Ok(())
 }
 
 /// Tells of the run's progress on stderr, and of the user's wish to stop.

@@ -11,7 +11,7 @@ use upcr_lab::data::Shapes;
 use upcr_lab::data::pairs::Protocol;
 use upcr_lab::models::weights::TensorFile;
 use upcr_lab::random;
-use upcr_lab::train::{Event, Stage, Trainer, TrainingConfig, Watcher};
+use upcr_lab::train::{Event, Length, Stage, Trainer, TrainingConfig, Watcher};
 
 fn shapes() -> Shapes {
     let cloud = |seed| -> Vec<[f32; 3]> {
@@ -25,11 +25,11 @@ fn config() -> TrainingConfig {
     TrainingConfig {
         seed: 4,
         stages: vec![
-            Stage { points: 32, k: Some(4), batch: 3, epochs: 4 },
-            Stage { points: 48, k: None, batch: 5, epochs: 3 },
+            Stage { points: 32, k: Some(4), batch: 3, length: Length::Epochs(4) },
+            Stage { points: 48, k: None, batch: 5, length: Length::Steps(7) },
         ],
         validation_every_nth: 6,
-        validation_epochs: 2,
+        validation_steps: 4,
         network: NetworkConfig { k: 6, widths: vec![8, 12, 16], head: vec![8], ..NetworkConfig::default() },
         ..TrainingConfig::default()
     }

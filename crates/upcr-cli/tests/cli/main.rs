@@ -4,6 +4,7 @@
 
 mod bad_input;
 mod commands;
+mod learning;
 mod register;
 
 use std::ffi::OsStr;

@@ -127,7 +127,7 @@ mod tests {
         let width = kind.values();
         let batch = values.len() / width;
         let tensor = Tensor::from_data(TensorData::new(values.to_vec(), [batch, width]), &Device::flex());
-        let found = rotations(kind, tensor).into_data().to_vec::<f32>().unwrap();
+        let found = rotations(kind, tensor).into_data().try_to_vec::<f32>().unwrap();
         found.chunks(9).map(|m| Matrix3::from_row_iterator(m.iter().map(|&v| f64::from(v)))).collect()
     }
 

@@ -26,7 +26,7 @@ fn uniform(rng: &mut ChaCha8Rng, count: usize) -> Vec<f32> {
 }
 
 fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().to_vec().unwrap()
+    tensor.into_data().try_to_vec().unwrap()
 }
 
 #[track_caller]

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use upcr::Result;
 
-use super::config::{Decay, Mixture, Stage, TrainingConfig};
-use super::history::{ValidationErrors, Watcher};
+use super::config::{Decay, Length, Mixture, Stage, TrainingConfig};
+use super::history::{ValidationErrors, Watcher, write_history};
 use super::trainer::{Poses, Trainer, Validation, validate};
 use crate::data::Shapes;
 use crate::models::Upcr;
@@ -28,17 +28,17 @@ impl TrainingConfig {
     /// The paper's fine-tuning: 200 epochs from a step size of 1e-4, on clouds of so many points.
     pub fn adaptation(network: &Upcr, points: usize, epochs: u64) -> Self {
         Self {
-            stages: vec![Stage { points, k: None, batch: 26, epochs }],
+            stages: vec![Stage { points, k: None, batch: 26, length: Length::Epochs(epochs) }],
             learning_rate: 1e-4,
             decay: Decay::Cosine,
-            validation_epochs: (epochs / 20).max(1),
             network: network.config.clone(),
             ..Self::default()
         }
     }
 }
 
-/// Learns on from all of `shapes` without labels. The run's checkpoint comes to `folder`.
+/// Learns on from all of `shapes` without labels. The run's checkpoint comes to `folder`; a run of the same
+/// configuration that was stopped there goes on.
 ///
 /// # Errors
 /// As [`Trainer::run`].
@@ -54,10 +54,11 @@ pub fn adapt(
     let points = config.stages.last().map_or(crate::data::pairs::POINTS, |stage| stage.points);
     let validation = Validation::new(shapes, mixture, points, &network.config)?;
     let before = validate(network, &validation);
-    let mut trainer = Trainer::from_network(config, network.clone(), folder)?;
+    let mut trainer = Trainer::adapting(config, network, folder)?;
     let finished = trainer.run_on(shapes, shapes, mixture, poses, watcher)?;
     let after = validate(trainer.network(), &validation);
     let helped = after.loss < before.loss;
     let network = if helped { trainer.network() } else { network }.clone();
+    write_history(folder, trainer.history())?;
     Ok(Adaptation { network, helped, errors: [before, after], finished })
 }

@@ -22,8 +22,10 @@ pub struct TrainingConfig {
     pub warmup_steps: u64,
     /// Shapes held out for validation: every so-many-th of the training split.
     pub validation_every_nth: usize,
-    /// Passes over the shapes between two validations.
-    pub validation_epochs: u64,
+    /// Steps between two validations.
+    pub validation_steps: u64,
+    /// Seconds between checkpoints.
+    pub checkpoint_seconds: f64,
     /// The network.
     pub network: NetworkConfig,
 }
@@ -40,8 +42,18 @@ pub struct Stage {
     pub k: Option<usize>,
     /// Pairs of a batch.
     pub batch: usize,
+    /// How long it is.
+    pub length: Length,
+}
+
+/// The length of a stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Length {
     /// Passes over the shapes.
-    pub epochs: u64,
+    Epochs(u64),
+    /// Steps, however many shapes there are.
+    Steps(u64),
 }
 
 /// How the step size changes over a run.
@@ -60,30 +72,36 @@ impl Default for TrainingConfig {
     fn default() -> Self {
         Self {
             seed: 0,
-            stages: vec![Stage { points: 1024, k: None, batch: 26, epochs: 500 }],
+            stages: vec![Stage { points: 1024, k: None, batch: 26, length: Length::Epochs(500) }],
             learning_rate: 1e-3,
             decay: Decay::Steps,
             warmup_steps: 0,
             validation_every_nth: 20,
-            validation_epochs: 5,
+            validation_steps: 1000,
+            checkpoint_seconds: 60.0,
             network: NetworkConfig::default(),
         }
     }
 }
 
 impl TrainingConfig {
-    /// A useful model in under an hour of two cores: half the width, and few points but at the end.
+    /// A useful model in under an hour of two cores: a quarter of the width, and few points but at the end.
     pub fn quick() -> Self {
         Self {
             stages: vec![
-                Stage { points: 256, k: Some(8), batch: 26, epochs: 60 },
-                Stage { points: 512, k: Some(14), batch: 26, epochs: 8 },
-                Stage { points: 1024, k: None, batch: 26, epochs: 3 },
+                Stage { points: 256, k: Some(8), batch: 26, length: Length::Steps(15_000) },
+                Stage { points: 512, k: Some(14), batch: 26, length: Length::Steps(700) },
+                Stage { points: 1024, k: None, batch: 26, length: Length::Steps(300) },
             ],
             learning_rate: 2e-3,
             decay: Decay::Cosine,
             warmup_steps: 200,
-            network: NetworkConfig { widths: vec![32, 32, 64, 128, 256], ..NetworkConfig::default() },
+            validation_steps: 1000,
+            network: NetworkConfig {
+                widths: vec![16, 16, 32, 64, 128],
+                head: vec![128, 64],
+                ..NetworkConfig::default()
+            },
             ..Self::default()
         }
     }
@@ -139,3 +157,46 @@ impl TrainingConfig {
 
 /// Protocols and how often each is taken.
 pub type Mixture = Vec<(Protocol, f64)>;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_come_back_from_their_file_form() {
+        for config in [TrainingConfig::default(), TrainingConfig::quick()] {
+            config.check().unwrap();
+            assert_eq!(TrainingConfig::from_toml(&config.to_toml()).unwrap(), config);
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_run_is_refused() {
+        for text in [
+            "learning_rate = 0.0",
+            "learnin_rate = 0.1",
+            "stages = []",
+            "stages = [{ points = 0, batch = 2, length = { steps = 3 } }]",
+            "validation_every_nth = 1",
+            "[network]\nwidths = []",
+            "[network]\nk = 0",
+            "[network]\ninvariant = \"colour\"",
+        ] {
+            assert!(TrainingConfig::from_toml(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn step_sizes_follow_their_decay() {
+        let config = |decay, warmup_steps| TrainingConfig { decay, warmup_steps, ..TrainingConfig::default() };
+        let steps = config(Decay::Steps, 0);
+        let sizes = [0, 299, 300, 600, 999].map(|step| steps.step_size(step, 1000));
+        for (found, expected) in sizes.into_iter().zip([1e-3, 1e-3, 1e-4, 1e-5, 1e-6]) {
+            assert!((found / expected - 1.0).abs() < 1e-9, "{sizes:?}");
+        }
+        let cosine = config(Decay::Cosine, 10);
+        assert!((cosine.step_size(0, 1000) - 1e-4).abs() < 1e-9);
+        assert!((cosine.step_size(500, 1000) - 0.505e-3).abs() < 1e-9);
+        assert!(cosine.step_size(999, 1000) < 1.01e-5);
+    }
+}

@@ -11,7 +11,7 @@ use upcr::net::NetworkConfig;
 use upcr::{Error, Result, Rigid};
 
 use super::checkpoint::{self, State};
-use super::config::{Mixture, Stage, TrainingConfig};
+use super::config::{Length, Mixture, Stage, TrainingConfig};
 use super::history::{Event, History, ValidationErrors, Watcher};
 use crate::data::Shapes;
 pub use crate::data::loader::Poses;
@@ -23,8 +23,6 @@ use crate::random;
 
 /// Share of a batch in the running statistics of batch norm.
 const STATISTICS_SHARE: f64 = 0.1;
-/// Time between checkpoints.
-const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
 /// Time between events.
 const EVENT_EVERY: Duration = Duration::from_secs(10);
 /// Threads that make batches: neighbours and features cost far less than a step.
@@ -111,14 +109,21 @@ impl Trainer {
         Ok(Self { folder: folder.into(), network, optimizer: adam(), state })
     }
 
-    /// A run on weights that were learned before.
+    /// A run on weights that were learned before; goes on where one of this configuration in `folder` was stopped.
     ///
     /// # Errors
-    /// Where the configuration cannot be run.
-    pub fn from_network(config: TrainingConfig, network: Upcr, folder: &Path) -> Result<Self> {
+    /// Where the configuration cannot be run, or a checkpoint is damaged.
+    pub fn adapting(config: TrainingConfig, network: &Upcr, folder: &Path) -> Result<Self> {
         config.check()?;
+        let device = network.devices().into_iter().next().unwrap_or_default();
+        if folder.join(CHECKPOINT).exists() {
+            let stopped = Self::resume(folder, &device.inner())?;
+            if stopped.state.config == config {
+                return Ok(stopped);
+            }
+        }
         let state = State { config, step: 0, seconds: 0.0, history: History::new() };
-        Ok(Self { folder: folder.into(), network, optimizer: adam(), state })
+        Ok(Self { folder: folder.into(), network: network.clone(), optimizer: adam(), state })
     }
 
     /// Goes on where the run in `folder` was stopped.
@@ -239,8 +244,7 @@ impl Trainer {
             self.state.seconds += start.elapsed().as_secs_f64();
 
             let step = self.state.step;
-            let validates = (step - place.first) % (per_epoch * config.validation_epochs.max(1)) == 0
-                || step == place.end;
+            let validates = step % config.validation_steps.max(1) == 0 || step == place.end;
             if validates || since.told.elapsed() >= EVENT_EVERY {
                 let event = Event {
                     step,
@@ -262,7 +266,7 @@ impl Trainer {
             if watcher.stop() {
                 return Ok(false);
             }
-            if saved.elapsed() >= CHECKPOINT_EVERY {
+            if saved.elapsed().as_secs_f64() >= config.checkpoint_seconds {
                 self.save()?;
                 saved = Instant::now();
             }
@@ -332,7 +336,10 @@ impl Stage {
     }
 
     fn steps(&self, shapes: usize) -> u64 {
-        self.epochs * self.steps_per_epoch(shapes)
+        match self.length {
+            Length::Epochs(epochs) => epochs * self.steps_per_epoch(shapes),
+            Length::Steps(steps) => steps,
+        }
     }
 }
 

@@ -1,0 +1,158 @@
+//! `upcr train`, `adapt` and `eval` on a handful of small shapes.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::Stdio;
+use std::time::Duration;
+
+use super::{Scratch, command, upcr};
+
+/// Settings of a run of seconds.
+const SETTINGS: &str = "\
+seed = 3
+checkpoint_seconds = 0.0
+validation_every_nth = 5
+validation_steps = 20
+stages = [
+  { points = 48, k = 6, batch = 4, length = { steps = 60 } },
+  { points = 64, batch = 4, length = { epochs = 6 } },
+]
+[network]
+k = 8
+widths = [8, 16, 32]
+head = [16]
+";
+
+/// A folder with twelve boxes of different sides, each some points on its faces.
+fn shapes(scratch: &Scratch) -> String {
+    let folder = scratch.path("shapes");
+    std::fs::create_dir(&folder).unwrap();
+    let mut state = 1_u64;
+    let mut uniform = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 40) as f64 / (1_u64 << 24) as f64
+    };
+    for shape in 0..12 {
+        let sides = [1.0, 0.4 + 0.5 * uniform(), 0.2 + 0.4 * uniform()];
+        let points: Vec<[f64; 3]> = (0..1500)
+            .map(|_| {
+                let mut p = [uniform(), uniform(), uniform()];
+                p[(3.0 * uniform()) as usize % 3] = (2.0 * uniform()).floor().min(1.0);
+                std::array::from_fn(|axis| (p[axis] - 0.5) * sides[axis] + f64::from(axis == 0) * p[1] * p[2])
+            })
+            .collect();
+        scratch.xyz(&format!("shapes/{shape:02}.xyz"), &points);
+    }
+    folder
+}
+
+/// The tensors of a safetensors file by name.
+fn tensors(path: &str) -> BTreeMap<String, Vec<u8>> {
+    let bytes = std::fs::read(path).unwrap();
+    let header = u64::from_le_bytes(*bytes.first_chunk().unwrap()) as usize;
+    let (header, data) = bytes[8..].split_at(header);
+    let header: BTreeMap<String, serde_json::Value> = serde_json::from_slice(header).unwrap();
+    let tensors = header.into_iter().filter(|(name, _)| name != "__metadata__");
+    tensors
+        .map(|(name, entry)| {
+            let at = |i: usize| entry["data_offsets"][i].as_u64().unwrap() as usize;
+            (name, data[at(0)..at(1)].to_vec())
+        })
+        .collect()
+}
+
+#[test]
+fn a_killed_run_is_resumed_to_the_same_weights() {
+    let scratch = Scratch::new();
+    let (shapes, settings) = (shapes(&scratch), scratch.file("run.toml", SETTINGS));
+    let start = |folder: &str| {
+        vec!["train".into(), "--data".into(), shapes.clone(), "--config".into(), settings.clone()]
+            .into_iter()
+            .chain(["--protocol".into(), "mixed".into(), "--out".into(), folder.to_owned()])
+            .collect::<Vec<String>>()
+    };
+    let whole = scratch.path("whole");
+    let run = upcr(start(&whole));
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    assert_eq!(run.stdout.trim(), format!("{whole}/weights.safetensors"));
+    for file in ["run.toml", "history.csv", "history.svg"] {
+        assert!(Path::new(&whole).join(file).exists(), "{file}");
+    }
+
+    let killed = scratch.path("killed");
+    let mut child = command().args(start(&killed)).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
+    let checkpoint = Path::new(&killed).join("checkpoint.safetensors");
+    // Some way into the run, wherever that is on this machine.
+    while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    std::thread::sleep(Duration::from_millis(u64::from(std::process::id() % 300)));
+    // On Unix this is SIGKILL.
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let run = upcr(["train", "--resume", &killed]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let [expected, found] = [&whole, &killed].map(|folder| tensors(&format!("{folder}/weights.safetensors")));
+    assert!(expected.len() > 20);
+    assert_eq!(found, expected);
+
+    upcr(start(&whole)).assert_fails(1, &["--resume"]);
+}
+
+#[test]
+fn weights_are_adapted_and_evaluated() {
+    let scratch = Scratch::new();
+    let (shapes, settings) = (shapes(&scratch), scratch.file("run.toml", SETTINGS));
+    let folder = scratch.path("run");
+    let run = upcr(["train", "--data", &shapes, "--config", &settings, "--out", &folder]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let weights = format!("{folder}/weights.safetensors");
+
+    let out = scratch.path("adapted");
+    let run = upcr([
+        "adapt", "--weights", &weights, "--clouds", &shapes, "--protocol", "upc", "--points", "128", "--epochs", "3",
+        "--learning-rate", "0.001", "--out", &out,
+    ]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let report: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(format!("{out}/adaptation.json")).unwrap()).unwrap();
+    let loss = |when: &str| report[when]["loss"].as_f64().unwrap();
+    assert_eq!(report["helped"].as_bool().unwrap(), loss("after") < loss("before"));
+    let adapted = tensors(&format!("{out}/weights.safetensors"));
+    assert_eq!(adapted != tensors(&weights), report["helped"].as_bool().unwrap());
+
+    let results = scratch.path("results.json");
+    let run = upcr([
+        "eval", "--data", &shapes, "--protocol", "upc,nd", "--overlap", "consistent,partial_shared", "--methods",
+        "upcr,icp,default", "--weights", &weights, "--out", &results,
+    ]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(&results).unwrap()).unwrap();
+    let rows = report["results"].as_array().unwrap();
+    assert_eq!(rows.len(), 12);
+    for key in [
+        "method", "protocol", "overlap", "noise", "pairs", "rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t",
+        "rre_mean_deg", "rte_mean", "me_bregier", "recall", "ms_per_pair",
+    ] {
+        assert!(rows.iter().all(|row| !row[key].is_null()), "{key}");
+    }
+    assert!(report["settings"]["version"].is_string());
+    assert_eq!(run.stdout.lines().count(), 14);
+    assert_eq!(std::fs::read_to_string(scratch.path("results.csv")).unwrap().lines().count(), 13);
+}
+
+#[test]
+fn bad_requests_are_refused() {
+    let scratch = Scratch::new();
+    let shapes = shapes(&scratch);
+    let bad = scratch.file("bad.toml", "stages = 3");
+    let out = scratch.path("out");
+    upcr(["train", "--data", &shapes, "--config", &bad, "--out", &out]).assert_fails(1, &["bad.toml"]);
+    upcr(["train", "--data", &scratch.path("none"), "--out", &out]).assert_fails(1, &["none"]);
+    upcr(["train", "--resume", &scratch.path("none")]).assert_fails(1, &["run.toml"]);
+    let text = scratch.file("weights.safetensors", "no weights");
+    upcr(["adapt", "--weights", &text, "--clouds", &shapes, "--out", &out]).assert_fails(1, &["weights.safetensors"]);
+    upcr(["eval", "--data", &shapes, "--weights", &text]).assert_fails(1, &["weights.safetensors"]);
+    upcr(["eval", "--data", &shapes, "--methods", "magic"]).assert_fails(1, &["magic"]);
+    assert_eq!(upcr(["train", "--data", &shapes]).status, 2);
+}

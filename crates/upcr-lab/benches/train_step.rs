@@ -1,0 +1,46 @@
+//! One training step of the paper's network: forward, loss, backward, Adam. Prints a JSON object; the arguments are
+//! pairs, points and repeats. `bench/train_step.py` holds it against a plain PyTorch form.
+#![allow(missing_docs, clippy::print_stdout, clippy::unwrap_used)]
+
+use std::time::Instant;
+
+use upcr_lab::Device;
+use upcr_lab::models::{CloudInput, Clouds};
+use upcr_lab::random;
+use upcr_lab::train::{Trainer, TrainingConfig};
+
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
+fn main() {
+    let numbers: Vec<usize> = std::env::args().filter_map(|arg| arg.parse().ok()).collect();
+    let [pairs, points, repeats] = *numbers else {
+        println!("{{\"usage\": \"train_step PAIRS POINTS REPEATS\"}}");
+        return;
+    };
+    let config = TrainingConfig::default();
+    let mut rng = random::stream(1, 0);
+    let mut cloud = || -> Vec<[f32; 3]> {
+        (0..points).map(|_| random::direction(&mut rng).map(|v| v as f32).into()).collect()
+    };
+    let mut input = || CloudInput::new(&cloud(), &config.network).unwrap();
+    let inputs: Vec<_> = (0..pairs).map(|_| (input(), input())).collect();
+    let clouds = Clouds::new(&inputs, config.network.k);
+    let folder = std::env::temp_dir();
+    let mut trainer = Trainer::new(config, &folder, &Device::flex()).unwrap();
+    let mut times_ms: Vec<f64> = (0..=repeats)
+        .map(|_| {
+            let start = Instant::now();
+            trainer.step(&clouds, 1e-3).unwrap();
+            start.elapsed().as_secs_f64() * 1e3
+        })
+        .skip(1)
+        .collect();
+    times_ms.sort_by(f64::total_cmp);
+    println!(
+        "{{\"pairs\": {pairs}, \"points\": {points}, \"ms_median\": {:.2}, \"ms_min\": {:.2}, \"threads\": {}}}",
+        times_ms[times_ms.len() / 2],
+        times_ms[0],
+        rayon::current_num_threads()
+    );
+}

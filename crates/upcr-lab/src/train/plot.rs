@@ -1,0 +1,114 @@
+//! The learning curve as a picture.
+
+use plotters::coord::Shift;
+use plotters::prelude::*;
+use plotters::style::RGBColor;
+use upcr::{Error, Result};
+
+use super::history::Event;
+
+/// Colours that the colour-blind can tell apart (Okabe and Ito).
+const BLUE: RGBColor = RGBColor(0, 114, 178);
+const ORANGE: RGBColor = RGBColor(230, 159, 0);
+const SIZE: (u32, u32) = (960, 420);
+
+type Panel<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+
+/// Loss and held-out rotation error over the steps, as SVG; empty for a curve without a point.
+///
+/// # Errors
+/// Where the picture cannot be drawn.
+pub fn learning_curve(history: &[Event]) -> Result<String> {
+    let mut text = String::new();
+    if history.is_empty() {
+        return Ok(text);
+    }
+    let failed = |reason: String| Error::InvalidSetting { name: "plot", reason };
+    let mut drawn = || -> std::result::Result<(), Box<dyn std::error::Error>> {
+        let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
+        root.fill(&WHITE)?;
+        let (left, right) = root.split_horizontally(SIZE.0 / 2);
+        let at = |value: fn(&Event) -> Option<f64>| -> Vec<(f64, f64)> {
+            let points = history.iter().filter_map(|e| Some((e.step as f64, value(e)?)));
+            points.filter(|(_, y)| y.is_finite() && *y > 0.0).collect()
+        };
+        panel(
+            &left,
+            "Chamfer loss",
+            &[
+                ("learned from", BLUE, at(|e| Some(e.loss))),
+                ("held out", ORANGE, at(|e| e.validation.map(|v| v.loss))),
+            ],
+        )?;
+        panel(
+            &right,
+            "held out: MAE(R), degrees",
+            &[("held out", ORANGE, at(|e| e.validation.map(|v| v.mae_r_deg)))],
+        )?;
+        root.present()?;
+        Ok(())
+    };
+    drawn().map_err(|e| failed(e.to_string()))?;
+    Ok(text)
+}
+
+/// Lines over the steps, the values' axis logarithmic.
+fn panel(
+    area: &Panel,
+    title: &str,
+    lines: &[(&str, RGBColor, Vec<(f64, f64)>)],
+) -> std::result::Result<(), Box<dyn std::error::Error>> {
+    let all = || lines.iter().flat_map(|(_, _, points)| points);
+    let last = all().map(|p| p.0).fold(1.0, f64::max);
+    let low = all().map(|p| p.1).fold(f64::INFINITY, f64::min);
+    let high = all().map(|p| p.1).fold(0.0, f64::max);
+    if !(low.is_finite() && high > 0.0) {
+        return Ok(());
+    }
+    let mut chart = ChartBuilder::on(area)
+        .caption(title, ("sans-serif", 18))
+        .margin(12)
+        .x_label_area_size(36)
+        .y_label_area_size(64)
+        .build_cartesian_2d(0.0..last, (low * 0.8..high * 1.25).log_scale())?;
+    chart.configure_mesh().light_line_style(WHITE).x_desc("steps").x_labels(6).draw()?;
+    for (name, color, points) in lines {
+        let color = *color;
+        chart
+            .draw_series(LineSeries::new(points.iter().copied(), color.stroke_width(2)))?
+            .label(*name)
+            .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], color.stroke_width(2)));
+    }
+    chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw()?;
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::train::ValidationErrors;
+
+    #[test]
+    fn a_curve_has_its_lines_and_none_has_no_picture() {
+        assert_eq!(learning_curve(&[]).unwrap(), "");
+        let event = |step: u64| Event {
+            step,
+            steps: 30,
+            points: 64,
+            loss: 1.0 / step as f64,
+            validation: Some(ValidationErrors {
+                loss: 1.1 / step as f64,
+                mae_r_deg: 20.0 / step as f64,
+                mae_t: 0.1,
+                recall: 0.5,
+            }),
+            learning_rate: 1e-3,
+            clouds_per_second: 10.0,
+            seconds: 1.0,
+        };
+        let picture = learning_curve(&[event(10), event(20), event(30)]).unwrap();
+        assert!(picture.starts_with("<svg"));
+        assert!(picture.matches("<polyline").count() >= 3, "{picture}");
+        assert!(picture.contains("MAE(R)"));
+    }
+}
