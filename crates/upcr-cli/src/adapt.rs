@@ -6,12 +6,14 @@ use std::sync::Arc;
 
 use anyhow::{Context, Result};
 use clap::ValueEnum;
-use upcr_lab::data::{self, Split, pairs};
+use upcr_lab::data::{self, Split, pairs::POINTS};
+use upcr_lab::files::write_atomically;
 use upcr_lab::models::weights::{TensorFile, restore, store};
-use upcr_lab::train::{Poses, TrainingConfig, adapt, write_atomically};
+use upcr_lab::train::{Poses, TrainingConfig, adapt};
 
 use crate::output;
-use crate::train::{Backend, Pairs, Teller};
+use crate::pairs::Pairs;
+use crate::train::{Backend, Teller};
 
 const AFTER_HELP: &str = "\
 Files in the output folder:
@@ -45,7 +47,7 @@ pub struct Args {
     #[arg(long, value_name = "N", default_value_t = 200)]
     epochs: u64,
     /// Points of a cloud
-    #[arg(long, value_name = "N", default_value_t = pairs::POINTS)]
+    #[arg(long, value_name = "N", default_value_t = POINTS)]
     points: usize,
     /// Adam's step size at the start
     #[arg(long, value_name = "SIZE", default_value_t = 1e-4)]

@@ -11,10 +11,10 @@ use upcr_lab::data::Split;
 use upcr_lab::data::pairs::Protocol;
 use upcr_lab::eval::methods::EvaluatedMethod;
 use upcr_lab::eval::run::{csv, evaluate, markdown};
-use upcr_lab::train::write_atomically;
+use upcr_lab::files::write_atomically;
 
 use crate::output::{self, Progress};
-use crate::train::Pairs;
+use crate::pairs::Pairs;
 
 /// Compare methods on a data set's test pairs
 #[derive(clap::Args)]
@@ -28,7 +28,7 @@ pub struct Args {
     /// Which part of its points a cloud keeps
     #[arg(long, value_enum, value_delimiter = ',', default_value = "consistent")]
     overlap: Vec<Overlap>,
-    /// Methods: upcr (the network alone, once), upcr+refine, icp, gicp, fgr, default
+    /// Methods: upcr (the network alone, once), upcr+refine, icp, gicp, fgr, consensus, default
     #[arg(long, value_delimiter = ',', default_value = "upcr,upcr+refine,icp,fgr,default")]
     methods: Vec<String>,
     /// Weights of the network [default: those in the program]
@@ -82,7 +82,7 @@ fn compare(args: &Args) -> Result<ExitCode> {
         args.methods.iter().map(|name| EvaluatedMethod::by_name(name)).collect::<Result<_, _>>()?;
     let mut settings = Settings::default();
     if let Some(path) = &args.weights {
-        settings.network = Arc::new(Network::load(path)?);
+        settings.network = Some(Arc::new(Network::load(path)?));
     }
     let mut progress = Progress::new();
     let mut rows = Vec::new();

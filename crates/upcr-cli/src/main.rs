@@ -1,14 +1,17 @@
 //! The command line of UPCR: parse, call, print.
 
+#[cfg(feature = "train")]
 mod adapt;
 mod convert;
-//mod eval;
+mod eval;
 mod features;
 mod info;
 mod input;
 mod output;
+mod pairs;
 mod register;
 mod synth;
+#[cfg(feature = "train")]
 mod train;
 
 use std::process::ExitCode;
@@ -50,9 +53,11 @@ enum Command {
     Synth(synth::Args),
     Convert(convert::Args),
     Info(info::Args),
+    #[cfg(feature = "train")]
     Train(train::Args),
+    #[cfg(feature = "train")]
     Adapt(adapt::Args),
-    //Eval(eval::Args),
+    Eval(eval::Args),
 }
 
 fn main() -> ExitCode {
@@ -62,9 +67,11 @@ fn main() -> ExitCode {
         Command::Synth(args) => synth::run(&args),
         Command::Convert(args) => convert::run(&args),
         Command::Info(args) => info::run(&args),
+        #[cfg(feature = "train")]
         Command::Train(args) => train::run(&args),
+        #[cfg(feature = "train")]
         Command::Adapt(args) => adapt::run(&args),
-        //Command::Eval(args) => eval::run(&args),
+        Command::Eval(args) => eval::run(&args),
     };
     outcome.unwrap_or_else(|error| {
         output::note(&format!("error: {}", describe(&error)));

@@ -6,10 +6,12 @@ use std::io::{BufRead, BufReader, stdin};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use serde::Serialize;
+use upcr::net::Network;
 use upcr::{Locks, Method, Refinement, Registration, RobustKernel, Settings, io};
 
 use crate::output::{self, Progress};
@@ -31,6 +33,9 @@ pub struct Args {
     /// Where the first pose comes from
     #[arg(long, value_enum, default_value_t = Settings::default().method)]
     method: Method,
+    /// Weights of the network [default: those in the program]
+    #[arg(long, value_name = "FILE")]
+    weights: Option<PathBuf>,
     /// What the refinement minimises
     #[arg(long, value_enum, default_value_t = Settings::default().refine)]
     refine: Refinement,
@@ -94,6 +99,7 @@ impl Args {
         }
         Ok(Settings {
             method: self.method,
+            network: self.weights.as_deref().map(Network::load).transpose()?.map(Arc::new),
             refine: self.refine,
             voxel_size: self.voxel_size,
             init: self.init.as_deref().map(io::read_transform).transpose()?,

@@ -1,6 +1,6 @@
 //! `upcr train`: a network learned without labels.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,13 +9,12 @@ use std::time::Duration;
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
-use upcr_lab::data::pairs::Protocol;
-use upcr_lab::data::{self, Half, Shapes, Split};
-use upcr_lab::train::{
-    Event, Mixture, Trainer, TrainingConfig, Watcher, write_atomically, write_history,
-};
+use upcr_lab::data::{Shapes, Split};
+use upcr_lab::files::write_atomically;
+use upcr_lab::train::{Event, Trainer, TrainingConfig, Watcher, write_history};
 
 use crate::output;
+use crate::pairs::Pairs;
 
 const AFTER_HELP: &str = "\
 Files in the run's folder:
@@ -61,20 +60,6 @@ pub struct Args {
     resume: Option<PathBuf>,
 }
 
-/// Pairs that are made of shapes (docs: the evaluation's settings have the same names).
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Pairs {
-    /// Unseen point clouds: the training split
-    Upc,
-    /// Unseen categories: the first half of the categories
-    Uc,
-    /// Noisy data: the training split, noise on every point
-    Nd,
-    /// All kinds at once: clean and noisy, whole and partial
-    Mixed,
-}
-
 #[derive(Clone, Copy, ValueEnum)]
 enum Preset {
     /// The paper's: 500 epochs of 1,024 points
@@ -100,36 +85,6 @@ impl Backend {
             #[cfg(feature = "cuda")]
             Self::Cuda => upcr_lab::Device::cuda(0),
         }
-    }
-}
-
-impl Pairs {
-    pub fn mixture(self, partial: bool) -> Mixture {
-        let whole = Protocol::CONSISTENT;
-        let [shared, own] = [Protocol::PARTIAL_SHARED, Protocol::PARTIAL_INDEPENDENT];
-        match (self, partial) {
-            (Self::Upc | Self::Uc, false) => vec![(whole, 1.0)],
-            (Self::Upc | Self::Uc, true) => vec![(shared, 1.0), (own, 1.0)],
-            (Self::Nd, false) => vec![(whole.noisy(), 1.0)],
-            (Self::Nd, true) => vec![(shared.noisy(), 1.0), (own.noisy(), 1.0)],
-            (Self::Mixed, _) => vec![
-                (whole, 4.0),
-                (whole.noisy(), 2.0),
-                (shared, 1.0),
-                (own, 1.0),
-                (shared.noisy(), 1.0),
-                (own.noisy(), 1.0),
-            ],
-        }
-    }
-
-    pub fn shapes(self, path: &Path, split: Split) -> Result<Shapes> {
-        let shapes = match (self, split) {
-            (Self::Uc, Split::Train) => data::open(path, Split::All)?.categories(Half::First),
-            (Self::Uc, _) => data::open(path, Split::All)?.categories(Half::Second),
-            _ => data::open(path, split)?,
-        };
-        Ok(shapes)
     }
 }
 

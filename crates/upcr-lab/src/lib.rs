@@ -2,6 +2,7 @@
 
 pub mod data;
 pub mod eval;
+pub mod files;
 #[cfg(feature = "train")]
 pub mod models;
 #[cfg(feature = "train")]

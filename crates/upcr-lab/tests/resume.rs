@@ -16,7 +16,9 @@ use upcr_lab::train::{Event, Length, Stage, Trainer, TrainingConfig, Watcher};
 fn shapes() -> Shapes {
     let cloud = |seed| -> Vec<[f32; 3]> {
         let mut rng = random::stream(seed, 1);
-        (0..100).map(|_| std::array::from_fn(|axis| rng.random_range(-0.5..0.5) / (axis + 1) as f32)).collect()
+        (0..100)
+            .map(|_| std::array::from_fn(|axis| rng.random_range(-0.5..0.5) / (axis + 1) as f32))
+            .collect()
     };
     Shapes { clouds: (0..12).map(cloud).collect(), labels: vec![0; 12], names: vec!["box".into()] }
 }

@@ -32,7 +32,13 @@ fn clouds(file: &TensorFile, config: &NetworkConfig) -> Clouds {
                 graph.bytes.as_chunks::<4>().0.iter().map(|b| u32::from_le_bytes(*b)).collect();
             // The same neighbours; among themselves in another order, perhaps.
             let sorted = |g: &Graph| -> Vec<Vec<u32>> {
-                (0..g.len()).map(|i| { let mut row = g.row(i).to_vec(); row.sort_unstable(); row }).collect()
+                (0..g.len())
+                    .map(|i| {
+                        let mut row = g.row(i).to_vec();
+                        row.sort_unstable();
+                        row
+                    })
+                    .collect()
             };
             assert_eq!(sorted(&input.graph), sorted(&Graph { k: config.k, neighbors }), "{role}");
             input

@@ -19,8 +19,6 @@ use crate::{
     verify::{Evidence, conditioning, covariance, distances, judge, overlap_at},
 };
 
-/// Probability from which no dearer source of hypotheses is asked.
-const SURE: f64 = 0.75;
 /// Hypotheses that are refined on the coarse level, and of those on the fine one.
 const COARSE_CANDIDATES: usize = 8;
 const FINE_CANDIDATES: usize = 3;
@@ -128,6 +126,7 @@ impl<'a> Pipeline<'a> {
                 target: self.target,
                 matches: &self.matches,
                 init: self.init,
+                network: self.settings.network.as_deref(),
                 tolerance: TOLERANCE_VOXELS * coarse,
                 seed: self.settings.seed,
             });
@@ -138,7 +137,7 @@ impl<'a> Pipeline<'a> {
             let start = Instant::now();
             let registration = self.verified();
             self.timings.verify += milliseconds(start);
-            let sure = registration.probability >= SURE;
+            let sure = registration.probability >= source.sure();
             best = Some(Registration { timings_ms: self.timings, ..registration });
             if sure {
                 break;
@@ -221,8 +220,9 @@ impl<'a> Pipeline<'a> {
                 &Schedule { max_iterations: 0, ..Schedule::settled(reach, keep) },
             )
         } else {
-            // A guess may be further off than a pose that matches agree on.
-            let first = if hypothesis.method == Method::Prior { 3.0 * reach } else { 1.5 * reach };
+            // A guess, or a network's, may be further off than a pose that matches agree on.
+            let rough = matches!(hypothesis.method, Method::Prior | Method::Upcr);
+            let first = if rough { 3.0 * reach } else { 1.5 * reach };
             let found = icp.refine(&few, &hypothesis.pose, &Schedule::fine(first, reach, keep));
             if few.len() == moved.len() {
                 found

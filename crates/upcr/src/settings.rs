@@ -1,11 +1,13 @@
 //! All that a registration can be told.
 
 use std::num::NonZeroUsize;
+use std::sync::Arc;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use crate::{
     Error, Result,
+    net::Network,
     refine::{Locks, Refinement, RobustKernel},
     transform::Rigid,
 };
@@ -20,6 +22,8 @@ pub enum Method {
     Auto,
     /// The given initial pose alone (identity where none is given).
     Prior,
+    /// The UPCR network.
+    Upcr,
     /// Fast Global Registration.
     Fgr,
     /// Feature RANSAC.
@@ -33,6 +37,9 @@ pub enum Method {
 pub struct Settings {
     /// Where the first pose comes from.
     pub method: Method,
+    /// The network that `Method::Upcr` asks, and `Method::Auto` first; `None`: the one in the library.
+    #[serde(serialize_with = "fingerprint")]
+    pub network: Option<Arc<Network>>,
     /// What the refinement minimises.
     pub refine: Refinement,
     /// The one scale that drives every radius, in the clouds' unit; `None`: derived from the clouds.
@@ -55,6 +62,7 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             method: Method::Auto,
+            network: None,
             refine: Refinement::Gicp,
             voxel_size: None,
             init: None,
@@ -87,5 +95,14 @@ impl Settings {
             return refused("init", reason);
         }
         Ok(())
+    }
+}
+
+/// A network is told by its weights' fingerprint.
+#[allow(clippy::ref_option)] // as serde calls it
+fn fingerprint<S: Serializer>(network: &Option<Arc<Network>>, serializer: S) -> Result<S::Ok, S::Error> {
+    match network {
+        Some(network) => serializer.collect_str(&format_args!("{:016x}", network.fingerprint())),
+        None => serializer.serialize_none(),
     }
 }

@@ -11,7 +11,8 @@ use upcr::{
     register,
 };
 
-const METHODS: [Method; 5] = [Method::Auto, Method::Prior, Method::Fgr, Method::Ransac, Method::Consensus];
+const METHODS: [Method; 6] =
+    [Method::Auto, Method::Prior, Method::Upcr, Method::Fgr, Method::Ransac, Method::Consensus];
 const REFINEMENTS: [Refinement; 4] =
     [Refinement::Gicp, Refinement::Plane, Refinement::Point, Refinement::None];
 

@@ -80,7 +80,8 @@ fn a_killed_run_is_resumed_to_the_same_weights() {
     }
 
     let killed = scratch.path("killed");
-    let mut child = command().args(start(&killed)).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
+    let mut child =
+        command().args(start(&killed)).stderr(Stdio::null()).stdout(Stdio::null()).spawn().unwrap();
     let checkpoint = Path::new(&killed).join("checkpoint.safetensors");
     // Some way into the run, wherever that is on this machine.
     while !checkpoint.exists() && child.try_wait().unwrap().is_none() {
@@ -110,8 +111,21 @@ fn weights_are_adapted_and_evaluated() {
 
     let out = scratch.path("adapted");
     let run = upcr([
-        "adapt", "--weights", &weights, "--clouds", &shapes, "--protocol", "upc", "--points", "128", "--epochs", "3",
-        "--learning-rate", "0.001", "--out", &out,
+        "adapt",
+        "--weights",
+        &weights,
+        "--clouds",
+        &shapes,
+        "--protocol",
+        "upc",
+        "--points",
+        "128",
+        "--epochs",
+        "3",
+        "--learning-rate",
+        "0.001",
+        "--out",
+        &out,
     ]);
     assert_eq!(run.status, 0, "{}", run.stderr);
     let report: serde_json::Value =
@@ -123,16 +137,39 @@ fn weights_are_adapted_and_evaluated() {
 
     let results = scratch.path("results.json");
     let run = upcr([
-        "eval", "--data", &shapes, "--protocol", "upc,nd", "--overlap", "consistent,partial_shared", "--methods",
-        "upcr,icp,default", "--weights", &weights, "--out", &results,
+        "eval",
+        "--data",
+        &shapes,
+        "--protocol",
+        "upc,nd",
+        "--overlap",
+        "consistent,partial_shared",
+        "--methods",
+        "upcr,icp,default",
+        "--weights",
+        &weights,
+        "--out",
+        &results,
     ]);
     assert_eq!(run.status, 0, "{}", run.stderr);
     let report: serde_json::Value = serde_json::from_slice(&std::fs::read(&results).unwrap()).unwrap();
     let rows = report["results"].as_array().unwrap();
     assert_eq!(rows.len(), 12);
     for key in [
-        "method", "protocol", "overlap", "noise", "pairs", "rmse_r_deg", "mae_r_deg", "rmse_t", "mae_t",
-        "rre_mean_deg", "rte_mean", "me_bregier", "recall", "ms_per_pair",
+        "method",
+        "protocol",
+        "overlap",
+        "noise",
+        "pairs",
+        "rmse_r_deg",
+        "mae_r_deg",
+        "rmse_t",
+        "mae_t",
+        "rre_mean_deg",
+        "rte_mean",
+        "me_bregier",
+        "recall",
+        "ms_per_pair",
     ] {
         assert!(rows.iter().all(|row| !row[key].is_null()), "{key}");
     }
@@ -151,7 +188,8 @@ fn bad_requests_are_refused() {
     upcr(["train", "--data", &scratch.path("none"), "--out", &out]).assert_fails(1, &["none"]);
     upcr(["train", "--resume", &scratch.path("none")]).assert_fails(1, &["run.toml"]);
     let text = scratch.file("weights.safetensors", "no weights");
-    upcr(["adapt", "--weights", &text, "--clouds", &shapes, "--out", &out]).assert_fails(1, &["weights.safetensors"]);
+    upcr(["adapt", "--weights", &text, "--clouds", &shapes, "--out", &out])
+        .assert_fails(1, &["weights.safetensors"]);
     upcr(["eval", "--data", &shapes, "--weights", &text]).assert_fails(1, &["weights.safetensors"]);
     upcr(["eval", "--data", &shapes, "--methods", "magic"]).assert_fails(1, &["magic"]);
     assert_eq!(upcr(["train", "--data", &shapes]).status, 2);

@@ -13,7 +13,7 @@ use rand::seq::SliceRandom;
 use upcr::{Error, Result, Rigid};
 
 use super::Shapes;
-use super::pairs::{Pair, Protocol};
+use super::pairs::{Mixture, Pair, Protocol};
 use crate::random;
 
 /// Finished batches that wait, for each thread.
@@ -35,7 +35,7 @@ pub enum Plan {
 #[derive(Debug, Clone)]
 pub struct Training {
     /// Protocols and how often each is taken, relative to the others; each pair draws its own.
-    pub mixture: Vec<(Protocol, f64)>,
+    pub mixture: Mixture,
     /// Points of every cloud, instead of what the protocols say; partial clouds are cut from larger ones.
     pub points: usize,
     /// Whether a shape's pair changes from epoch to epoch.
@@ -433,7 +433,13 @@ mod tests {
             Loader::start(&shapes, &plan, size, threads, |_| Ok(())).is_ok()
         };
         let mixed = |mixture, points| {
-            Plan::Training(Training { mixture, points, poses: Poses::Fresh, seed: 0, from: Position::default() })
+            Plan::Training(Training {
+                mixture,
+                points,
+                poses: Poses::Fresh,
+                seed: 0,
+                from: Position::default(),
+            })
         };
         let good = || mixed(vec![(Protocol::CONSISTENT, 1.0)], 100);
         assert!(start(shapes(5), good(), 2, 1));

@@ -73,6 +73,9 @@ pub struct Protocol {
     pub outlier_ratio: f64,
 }
 
+/// Protocols and how often each is taken, relative to the others.
+pub type Mixture = Vec<(Protocol, f64)>;
+
 /// Two clouds and the motion between them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pair {

@@ -1,7 +1,5 @@
 //! The methods that evaluations compare, each as a function from a pair of clouds to a pose.
 
-use std::sync::Arc;
-
 use upcr::net::Network;
 use upcr::{Error, Method, PointCloud, Refinement, Result, Rigid, Settings, register};
 
@@ -14,12 +12,13 @@ pub struct EvaluatedMethod {
 }
 
 /// Every method there is. A new one is a line here.
-pub const METHODS: [EvaluatedMethod; 6] = [
+pub const METHODS: [EvaluatedMethod; 7] = [
     EvaluatedMethod { name: "upcr", estimate: one_pass },
     EvaluatedMethod { name: "upcr+refine", estimate: one_pass_refined },
     EvaluatedMethod { name: "icp", estimate: icp },
     EvaluatedMethod { name: "gicp", estimate: gicp },
     EvaluatedMethod { name: "fgr", estimate: fgr },
+    EvaluatedMethod { name: "consensus", estimate: consensus },
     EvaluatedMethod { name: "default", estimate: default },
 ];
 
@@ -47,10 +46,10 @@ impl EvaluatedMethod {
 
 /// The network alone, once.
 fn one_pass(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
-    let single = |cloud: &PointCloud| -> Vec<[f32; 3]> {
-        cloud.points.iter().map(|p| p.map(|v| v as f32)).collect()
-    };
-    upcr::net::Network::load("x")?.predict(&single(source), &single(target))
+    let single =
+        |cloud: &PointCloud| -> Vec<[f32; 3]> { cloud.points.iter().map(|p| p.map(|v| v as f32)).collect() };
+    let network = settings.network.clone().map_or_else(Network::embedded, Ok)?;
+    network.predict(&single(source), &single(target))
 }
 
 /// The network once, and the default refinement from there.
@@ -78,12 +77,13 @@ fn fgr(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<
     Ok(register(source, target, &settings)?.T_target_source)
 }
 
+/// Feature matches that agree with each other, and the default refinement from there.
+fn consensus(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
+    let settings = Settings { method: Method::Consensus, ..settings.clone() };
+    Ok(register(source, target, &settings)?.T_target_source)
+}
+
 /// What `register` does when it is told nothing.
 fn default(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
     Ok(register(source, target, settings)?.T_target_source)
-}
-
-/// Settings with a network of one's own.
-pub fn with_network(network: Arc<Network>) -> Settings {
-    { let _ = network; Settings::default() }
 }

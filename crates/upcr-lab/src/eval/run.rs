@@ -111,7 +111,12 @@ pub fn evaluate(
     })
 }
 
-fn estimated(method: &EvaluatedMethod, source: &PointCloud, target: &PointCloud, settings: &Settings) -> Rigid {
+fn estimated(
+    method: &EvaluatedMethod,
+    source: &PointCloud,
+    target: &PointCloud,
+    settings: &Settings,
+) -> Rigid {
     method.estimate(source, target, settings).unwrap_or_else(|_| Rigid::identity())
 }
 

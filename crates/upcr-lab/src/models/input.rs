@@ -34,10 +34,8 @@ impl CloudInput {
             sum.iter_mut().zip(p).for_each(|(s, &v)| *s += f64::from(v));
         }
         let centroid = sum.map(|s| (s / points.len() as f64) as f32);
-        let points: Vec<[f32; 3]> = points
-            .iter()
-            .map(|p| [p[0] - centroid[0], p[1] - centroid[1], p[2] - centroid[2]])
-            .collect();
+        let points: Vec<[f32; 3]> =
+            points.iter().map(|p| [p[0] - centroid[0], p[1] - centroid[1], p[2] - centroid[2]]).collect();
         let neighborhoods = KdTree::new(&points).knn_graph(config.k);
         let phi = config.invariant.inputs(&points, &neighborhoods)?;
         Ok(Self { points, centroid, graph: Graph::from(&neighborhoods), phi })

@@ -89,8 +89,9 @@ impl NormalizedLayer {
     #[must_use]
     pub fn observed(mut self, batch: &[Tensor<1>; 2], share: f64) -> Self {
         let [mean, variance] = batch;
-        let towards =
-            |running: Tensor<1>, batch: &Tensor<1>| (running * (1.0 - share) + batch.clone() * share).detach();
+        let towards = |running: Tensor<1>, batch: &Tensor<1>| {
+            (running * (1.0 - share) + batch.clone() * share).detach()
+        };
         self.mean = self.mean.map(|running| towards(running, mean));
         self.var = self.var.map(|running| towards(running, variance));
         self

@@ -134,7 +134,8 @@ mod tests {
     #[test]
     fn all_kinds_follow_the_library() {
         let mut rng = random::stream(3, 0);
-        for kind in [RotationKind::Euler, RotationKind::Quaternion, RotationKind::SixD, RotationKind::Matrix] {
+        for kind in [RotationKind::Euler, RotationKind::Quaternion, RotationKind::SixD, RotationKind::Matrix]
+        {
             let width = kind.values();
             let values: Vec<f32> = (0..20 * width).map(|_| rng.random_range(-0.6..0.6)).collect();
             for (found, values) in matrices(kind, &values).iter().zip(values.chunks(width)) {

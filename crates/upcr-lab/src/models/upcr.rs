@@ -152,7 +152,8 @@ impl Upcr {
                 }
             };
             let map = layer.map(self.config.negative_slope);
-            let Normalized { values, statistics } = graph_layer(features, map, graph, given(layer, statistics));
+            let Normalized { values, statistics } =
+                graph_layer(features, map, graph, given(layer, statistics));
             features = values;
             found.push(statistics);
         }
@@ -221,7 +222,11 @@ fn dynamic_graph(features: &Tensor<2>, graph: &BatchGraph) -> BatchGraph {
     let clouds: Vec<upcr::net::Graph> = (0..graph.clouds())
         .map(|cloud| {
             let rows = graph.cloud(cloud);
-            upcr::net::Graph::of_features(&values[rows.start * channels..rows.end * channels], channels, graph.k)
+            upcr::net::Graph::of_features(
+                &values[rows.start * channels..rows.end * channels],
+                channels,
+                graph.k,
+            )
         })
         .collect();
     BatchGraph::new(&clouds, graph.k)

@@ -61,8 +61,11 @@ impl TensorFile {
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| malformed(e.to_string()))?;
         let file = SafeTensors::deserialize(bytes).map_err(|e| malformed(e.to_string()))?;
         let tensors = file.iter().map(|(name, view)| {
-            let stored =
-                StoredTensor { dtype: view.dtype(), shape: view.shape().to_vec(), bytes: view.data().to_vec() };
+            let stored = StoredTensor {
+                dtype: view.dtype(),
+                shape: view.shape().to_vec(),
+                bytes: view.data().to_vec(),
+            };
             (name.to_owned(), stored)
         });
         let metadata = header.metadata().iter().flatten();
@@ -174,7 +177,9 @@ fn replace<const D: usize>(
     let values = stored
         .to_f32()
         .filter(|values| stored.shape == shape && values.iter().all(|v| v.is_finite()))
-        .ok_or_else(|| malformed(path, format!("{name} must be finite single-precision values of shape {shape:?}")))?;
+        .ok_or_else(|| {
+            malformed(path, format!("{name} must be finite single-precision values of shape {shape:?}"))
+        })?;
     let tensor = Tensor::from_data(TensorData::new(values, shape), &old.device());
     let tensor = if old.is_require_grad() { tensor.require_grad() } else { tensor };
     *parameter = Param::initialized(parameter.id, tensor);

@@ -28,7 +28,11 @@ impl PairPoints {
 
 /// The loss of every pair, and its gradients with respect to the rotations (`[clouds, 9]`, row by row) and the
 /// translations (`[clouds, 3]`) that lead from a canonical shape to its cloud: X = R·X_c + t.
-pub fn forward(rotations: &[f32], translations: &[f32], clouds: &PairPoints) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
+pub fn forward(
+    rotations: &[f32],
+    translations: &[f32],
+    clouds: &PairPoints,
+) -> (Vec<f32>, Vec<f32>, Vec<f32>) {
     let pairs = clouds.pairs();
     let found: Vec<_> = (0..pairs)
         .into_par_iter()
@@ -110,9 +114,8 @@ fn pose_gradients(
 fn nearest_points(x: &[[f32; 3]], y: &[[f32; 3]], nearest: &mut [u32]) {
     // Padded with points that are nearest to nothing.
     let padded = y.len().next_multiple_of(LANES);
-    let coordinates: Vec<f32> = (0..3)
-        .flat_map(|a| (0..padded).map(move |j| y.get(j).map_or(f32::INFINITY, |p| p[a])))
-        .collect();
+    let coordinates: Vec<f32> =
+        (0..3).flat_map(|a| (0..padded).map(move |j| y.get(j).map_or(f32::INFINITY, |p| p[a]))).collect();
     search(x, &coordinates, padded, nearest);
 }
 

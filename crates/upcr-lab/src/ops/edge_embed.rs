@@ -163,8 +163,7 @@ pub fn forward_with(
     graph: &BatchGraph,
 ) -> Vec<f32> {
     let outputs = parameters.gamma.len();
-    let mean =
-        statistics.mean.iter().zip(signs(parameters.gamma)).map(|(m, s)| f64::from(m * s)).collect();
+    let mean = statistics.mean.iter().zip(signs(parameters.gamma)).map(|(m, s)| f64::from(m * s)).collect();
     let variance: Vec<f64> = statistics.variance.iter().map(|&v| f64::from(v)).collect();
     let norm = Norm::new(mean, &variance, parameters);
     let (largest, _) = gathered(inputs, &turn(parameters), outputs, graph);
@@ -256,7 +255,12 @@ fn turn(parameters: &Parameters) -> Vec<f32> {
 }
 
 /// The largest v over every row's edges, and its place.
-fn gathered(inputs: &EdgeInputs, turned: &[f32], outputs: usize, graph: &BatchGraph) -> (Buffer<f32>, Buffer<u8>) {
+fn gathered(
+    inputs: &EdgeInputs,
+    turned: &[f32],
+    outputs: usize,
+    graph: &BatchGraph,
+) -> (Buffer<f32>, Buffer<u8>) {
     let (edge_dim, point_dim) = (inputs.phi.edge_dim, inputs.phi.point_dim);
     let values = graph.rows() * outputs;
     let (mut largest, mut winners) = (Buffer::new(values), Buffer::new(values));

@@ -51,7 +51,8 @@ pub fn graph_layer(
     if !on_cpu(&features.device()) {
         return generic::graph_layer(features, map, graph, statistics);
     }
-    let context = Context { graph: graph.clone(), negative_slope: map.negative_slope, statistics: fixed(statistics) };
+    let context =
+        Context { graph: graph.clone(), negative_slope: map.negative_slope, statistics: fixed(statistics) };
     let [weight, gamma, beta] = dispatched(map);
     normalized(Dispatch::graph_layer(features.into_dispatch(), weight, gamma, beta, context))
 }
@@ -66,7 +67,8 @@ pub fn edge_embed(
     if !on_cpu(&map.weight.device()) {
         return generic::edge_embed(inputs, map, graph, statistics);
     }
-    let context = Context { graph: graph.clone(), negative_slope: map.negative_slope, statistics: fixed(statistics) };
+    let context =
+        Context { graph: graph.clone(), negative_slope: map.negative_slope, statistics: fixed(statistics) };
     let [weight, gamma, beta] = dispatched(map);
     normalized(Dispatch::edge_embed(weight, gamma, beta, Data(inputs.clone()), context))
 }
@@ -81,7 +83,11 @@ pub fn pool_max(features: Tensor<2>, graph: &Arc<BatchGraph>) -> Tensor<2> {
 
 /// The Chamfer distance of every pair in canonical poses, `[pairs]`, from rotations `[clouds, 9]` and translations
 /// `[clouds, 3]`.
-pub fn canonical_chamfer(rotations: Tensor<2>, translations: Tensor<2>, clouds: &Arc<PairPoints>) -> Tensor<1> {
+pub fn canonical_chamfer(
+    rotations: Tensor<2>,
+    translations: Tensor<2>,
+    clouds: &Arc<PairPoints>,
+) -> Tensor<1> {
     if !on_cpu(&rotations.device()) {
         return generic::canonical_chamfer(rotations, translations, clouds);
     }
@@ -95,9 +101,8 @@ fn on_cpu(device: &Device) -> bool {
 
 fn fixed(statistics: Option<[Tensor<1>; 2]>) -> Option<Arc<EdgeStatistics>> {
     let values = |tensor: Tensor<1>| tensor.into_data().iter::<f32>().collect();
-    statistics.map(|[mean, variance]| {
-        Arc::new(EdgeStatistics { mean: values(mean), variance: values(variance) })
-    })
+    statistics
+        .map(|[mean, variance]| Arc::new(EdgeStatistics { mean: values(mean), variance: values(variance) }))
 }
 
 fn dispatched(map: NormalizedMap) -> [FloatTensor<Dispatch>; 3] {
@@ -182,10 +187,7 @@ fn columns(tensor: &FlexTensor) -> usize {
     tensor.layout().shape()[1]
 }
 
-fn parameters<'a>(
-    [weight, gamma, beta]: [&'a FlexTensor; 3],
-    context: &Context,
-) -> Parameters<'a> {
+fn parameters<'a>([weight, gamma, beta]: [&'a FlexTensor; 3], context: &Context) -> Parameters<'a> {
     Parameters {
         weight: values(weight),
         gamma: values(gamma),
@@ -342,13 +344,8 @@ impl<C: CheckpointStrategy> CloudOperations for Autodiff<Flex, C> {
                 let Kept(([weight, gamma, beta], inputs, context, kept)) = &ops.state;
                 let grad_out = grads.consume::<Flex>(&ops.node).to_contiguous();
                 let parameters = parameters([weight, gamma, beta], context);
-                let found = embed_kernel::backward(
-                    &inputs.0,
-                    &parameters,
-                    &context.graph,
-                    kept,
-                    values(&grad_out),
-                );
+                let found =
+                    embed_kernel::backward(&inputs.0, &parameters, &context.graph, kept, values(&grad_out));
                 let shapes = [weight, gamma, beta].map(|tensor| tensor.layout().shape().to_vec());
                 let found = [found.weight, found.gamma, found.beta];
                 for ((parent, found), shape) in ops.parents.into_iter().zip(found).zip(shapes) {

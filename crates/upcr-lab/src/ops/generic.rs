@@ -24,11 +24,7 @@ fn neighbor_rows(graph: &BatchGraph, device: &Device) -> Tensor<1, Int> {
 
 /// Norm and rectifier of edge values `[rows, k, outputs]`, then the maximum over k. The norm's statistics are those of
 /// all edges.
-fn reduce_edges(
-    v: Tensor<3>,
-    map: &NormalizedMap,
-    statistics: Option<[Tensor<1>; 2]>,
-) -> Normalized {
+fn reduce_edges(v: Tensor<3>, map: &NormalizedMap, statistics: Option<[Tensor<1>; 2]>) -> Normalized {
     let [rows, k, outputs] = v.dims();
     let [mean, variance] = statistics.unwrap_or_else(|| {
         let edges = v.clone().reshape([rows * k, outputs]);

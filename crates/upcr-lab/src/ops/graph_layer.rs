@@ -81,7 +81,8 @@ pub(super) struct Norm {
 impl Norm {
     /// From the statistics of the values with signs turned.
     pub fn new(mean: Vec<f64>, variance: &[f64], parameters: &Parameters) -> Self {
-        let deviation_inverse: Vec<f64> = variance.iter().map(|v| 1.0 / (v.max(0.0) + EPSILON).sqrt()).collect();
+        let deviation_inverse: Vec<f64> =
+            variance.iter().map(|v| 1.0 / (v.max(0.0) + EPSILON).sqrt()).collect();
         let scale: Vec<f64> =
             deviation_inverse.iter().zip(parameters.gamma).map(|(d, g)| d * f64::from(g.abs())).collect();
         let shift = (0..scale.len()).map(|c| (f64::from(parameters.beta[c]) - mean[c] * scale[c]) as f32);
@@ -182,7 +183,14 @@ pub fn forward_with(
         point_products(features, graph, cloud, &folded, &mut products);
         let mut largest = Buffer::new(rows * outputs);
         let (mut sums, mut winners) = (Buffer::new(rows * outputs), Buffer::new(rows * outputs));
-        gather(&graph.view(cloud), &products, &mut largest, &mut sums, &mut winners, &mut vec![0.0; 2 * outputs]);
+        gather(
+            &graph.view(cloud),
+            &products,
+            &mut largest,
+            &mut sums,
+            &mut winners,
+            &mut vec![0.0; 2 * outputs],
+        );
         normalize(&largest, &norm.scale, &norm.shift, parameters.negative_slope, out);
     });
     out
@@ -211,7 +219,14 @@ pub fn backward(
             let values = rows.start * outputs..rows.end * outputs;
             let mut totals = vec![0.0; 2 * outputs];
             let slope = parameters.negative_slope;
-            through_rectifier(&kept.largest[values.clone()], &grad_out[values], norm, slope, winning, &mut totals);
+            through_rectifier(
+                &kept.largest[values.clone()],
+                &grad_out[values],
+                norm,
+                slope,
+                winning,
+                &mut totals,
+            );
             totals
         })
         .collect();
@@ -271,8 +286,10 @@ pub fn backward(
     }
     let mut weight = vec![0.0; 2 * inputs * outputs];
     let (own, difference) = weight.split_at_mut(inputs * outputs);
-    for ((own, difference), grad) in
-        own.chunks_exact_mut(outputs).zip(difference.chunks_exact_mut(outputs)).zip(total.chunks_exact(2 * outputs))
+    for ((own, difference), grad) in own
+        .chunks_exact_mut(outputs)
+        .zip(difference.chunks_exact_mut(outputs))
+        .zip(total.chunks_exact(2 * outputs))
     {
         for c in 0..outputs {
             own[c] = grad[c] * norm.signs[c];
@@ -282,7 +299,12 @@ pub fn backward(
     let gamma = (0..outputs)
         .map(|c| (totals[outputs + c] * f64::from(norm.deviation_inverse[c])) as f32 * norm.signs[c])
         .collect();
-    Gradients { features: grad_features, weight, gamma, beta: totals[..outputs].iter().map(|&t| t as f32).collect() }
+    Gradients {
+        features: grad_features,
+        weight,
+        gamma,
+        beta: totals[..outputs].iter().map(|&t| t as f32).collect(),
+    }
 }
 
 /// [W₁ - W₂ | W₂] with the signs of negative scales turned, `[inputs, 2 · outputs]`.

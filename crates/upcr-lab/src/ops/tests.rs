@@ -38,7 +38,12 @@ fn assert_close(what: &str, found: &[f32], expected: &[f32]) {
 }
 
 /// Clouds of given sizes with their graphs and distance features.
-fn clouds(sizes: &[usize], k: usize, kind: Invariant, rng: &mut ChaCha8Rng) -> (Arc<BatchGraph>, Arc<EdgeInputs>) {
+fn clouds(
+    sizes: &[usize],
+    k: usize,
+    kind: Invariant,
+    rng: &mut ChaCha8Rng,
+) -> (Arc<BatchGraph>, Arc<EdgeInputs>) {
     let (graphs, inputs): (Vec<Graph>, Vec<InvariantInputs>) = sizes
         .iter()
         .map(|&size| {
@@ -88,7 +93,11 @@ fn random_map(inputs: usize, outputs: usize, rng: &mut ChaCha8Rng) -> Normalized
 }
 
 /// Values, and the gradients of a weighted sum of them with respect to the map's parameters and `features`.
-fn with_gradients(out: Tensor<2>, map: &NormalizedMap, features: Option<&Tensor<2>>) -> Vec<(&'static str, Vec<f32>)> {
+fn with_gradients(
+    out: Tensor<2>,
+    map: &NormalizedMap,
+    features: Option<&Tensor<2>>,
+) -> Vec<(&'static str, Vec<f32>)> {
     let shape = out.dims();
     let weights = uniform(&mut random::stream(99, 0), shape[0] * shape[1]);
     let gradients = (out.clone() * tensor(weights, shape)).sum().backward();
@@ -120,8 +129,7 @@ fn a_graph_layer_is_its_edge_tensor_form() {
         let fused_values = with_gradients(fused.values, &map, Some(&features));
         let other = generic::graph_layer(features.clone(), map.clone(), &graph, None);
         let other_values = with_gradients(other.values, &map, Some(&features));
-        for ((name, expected), (fused, other)) in
-            expected.iter().zip(fused_values.iter().zip(&other_values))
+        for ((name, expected), (fused, other)) in expected.iter().zip(fused_values.iter().zip(&other_values))
         {
             assert_close(&format!("K = {k}: {name}"), &fused.1, expected);
             assert_close(&format!("K = {k}: generic {name}"), &other.1, expected);
@@ -185,8 +193,10 @@ fn given_statistics_take_the_place_of_the_batch() {
     let features = tensor(uniform(&mut rng, 70 * 4), [70, 4]);
     let given = || {
         let mut rng = random::stream(25, 0);
-        Some([uniform(&mut rng, 16), uniform(&mut rng, 16).iter().map(|v| v * v + 0.5).collect()]
-            .map(|v| Tensor::from_data(TensorData::new(v, [16]), &Device::flex())))
+        Some(
+            [uniform(&mut rng, 16), uniform(&mut rng, 16).iter().map(|v| v * v + 0.5).collect()]
+                .map(|v| Tensor::from_data(TensorData::new(v, [16]), &Device::flex())),
+        )
     };
     let inner = |map: &NormalizedMap| NormalizedMap {
         weight: map.weight.clone().inner(),
@@ -216,10 +226,11 @@ fn pooling_takes_each_clouds_largest() {
     let (graph, _) = clouds(&[9, 20, 14], 3, Invariant::None, &mut rng);
     let features = tensor(uniform(&mut rng, 43 * 21), [43, 21]).require_grad();
     let weights = tensor(uniform(&mut rng, 3 * 21), [3, 21]);
-    let found = [extension::pool_max(features.clone(), &graph), generic::pool_max(features.clone(), &graph)].map(|out| {
-        let gradients = (out.clone() * weights.clone()).sum().backward();
-        (values(out), values(features.grad(&gradients).unwrap()))
-    });
+    let found = [extension::pool_max(features.clone(), &graph), generic::pool_max(features.clone(), &graph)]
+        .map(|out| {
+            let gradients = (out.clone() * weights.clone()).sum().backward();
+            (values(out), values(features.grad(&gradients).unwrap()))
+        });
     assert_eq!(found[0], found[1]);
 }
 
@@ -244,7 +255,11 @@ fn the_loss_and_its_gradients_are_those_of_the_plain_form() {
     .map(|loss| {
         let weights = tensor(vec![0.3, 1.7], [2]);
         let gradients = (loss.clone() * weights).sum().backward();
-        [values(loss), values(rotations.grad(&gradients).unwrap()), values(translations.grad(&gradients).unwrap())]
+        [
+            values(loss),
+            values(rotations.grad(&gradients).unwrap()),
+            values(translations.grad(&gradients).unwrap()),
+        ]
     });
     for (fused, plain) in found[0].iter().zip(&found[1]) {
         assert_close("loss", fused, plain);

@@ -5,10 +5,11 @@ use std::sync::Arc;
 
 use upcr::Result;
 
-use super::config::{Decay, Length, Mixture, Stage, TrainingConfig};
+use super::config::{Decay, Length, Stage, TrainingConfig};
 use super::history::{ValidationErrors, Watcher, write_history};
 use super::trainer::{Poses, Trainer, Validation, validate};
 use crate::data::Shapes;
+use crate::data::pairs::Mixture;
 use crate::models::Upcr;
 
 /// What came of an adaptation.

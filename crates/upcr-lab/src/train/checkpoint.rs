@@ -1,8 +1,7 @@
 //! What a run needs to go on as if it had never stopped: one file, written atomically.
 
-use std::fs::{self, File};
-use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::fs;
+use std::path::Path;
 
 use burn::optim::ModuleOptimizer;
 use burn::tensor::{Bytes, Device};
@@ -12,6 +11,7 @@ use upcr::{Error, Result};
 
 use super::config::TrainingConfig;
 use super::history::History;
+use crate::files::write_atomically;
 use crate::models::Upcr;
 use crate::models::weights::{StoredTensor, TensorFile, restore, store};
 
@@ -29,12 +29,7 @@ pub(super) struct State {
     pub history: History,
 }
 
-pub(super) fn save(
-    path: &Path,
-    state: &State,
-    network: &Upcr,
-    optimizer: &ModuleOptimizer,
-) -> Result<()> {
+pub(super) fn save(path: &Path, state: &State, network: &Upcr, optimizer: &ModuleOptimizer) -> Result<()> {
     let failed = |reason: String| Error::InvalidSetting { name: "checkpoint", reason };
     let mut file = store(network);
     let bytes = optimizer.into_bytes().map_err(|e| failed(e.to_string()))?.to_vec();
@@ -61,21 +56,4 @@ pub(super) fn load(
         .from_bytes(Bytes::from_bytes_vec(stored.bytes.clone()))
         .map_err(|e| malformed(format!("{OPTIMIZER}: {e}")))?;
     Ok((state, network, optimizer))
-}
-
-/// Writes a file so that at any instant its old or its new content is there, whole.
-///
-/// # Errors
-/// Where the operating system refuses.
-pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".part");
-    let part = PathBuf::from(name);
-    let write = || {
-        let mut file = File::create(&part)?;
-        file.write_all(bytes)?;
-        file.sync_all()?;
-        fs::rename(&part, path)
-    };
-    write().map_err(|source| Error::Io { path: path.into(), source })
 }

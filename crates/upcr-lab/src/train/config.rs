@@ -4,8 +4,6 @@ use serde::{Deserialize, Serialize};
 use upcr::net::NetworkConfig;
 use upcr::{Error, Result};
 
-use crate::data::pairs::Protocol;
-
 /// A training run. The default is the paper's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -137,7 +135,10 @@ impl TrainingConfig {
             return refused("learning_rate", "must be positive and finite");
         }
         if self.validation_every_nth < 2 {
-            return refused("validation_every_nth", "must be 2 at least: something must be left to learn from");
+            return refused(
+                "validation_every_nth",
+                "must be 2 at least: something must be left to learn from",
+            );
         }
         Ok(())
     }
@@ -154,9 +155,6 @@ impl TrainingConfig {
         self.learning_rate * decay * warm
     }
 }
-
-/// Protocols and how often each is taken.
-pub type Mixture = Vec<(Protocol, f64)>;
 
 #[cfg(test)]
 mod tests {
@@ -188,7 +186,8 @@ mod tests {
 
     #[test]
     fn step_sizes_follow_their_decay() {
-        let config = |decay, warmup_steps| TrainingConfig { decay, warmup_steps, ..TrainingConfig::default() };
+        let config =
+            |decay, warmup_steps| TrainingConfig { decay, warmup_steps, ..TrainingConfig::default() };
         let steps = config(Decay::Steps, 0);
         let sizes = [0, 299, 300, 600, 999].map(|step| steps.step_size(step, 1000));
         for (found, expected) in sizes.into_iter().zip([1e-3, 1e-3, 1e-4, 1e-5, 1e-6]) {

@@ -7,8 +7,8 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use upcr::Result;
 
-use super::checkpoint::write_atomically;
 use super::plot::learning_curve;
+use crate::files::write_atomically;
 
 /// Errors on pairs that no gradient came from, whose true poses are known.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

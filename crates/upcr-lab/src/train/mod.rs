@@ -8,8 +8,7 @@ mod plot;
 mod trainer;
 
 pub use adapt::{Adaptation, adapt};
-pub use checkpoint::write_atomically;
-pub use config::{Decay, Length, Mixture, Stage, TrainingConfig};
+pub use config::{Decay, Length, Stage, TrainingConfig};
 pub use history::{Event, History, Silent, ValidationErrors, Watcher, write_history};
 pub use plot::learning_curve;
 pub use trainer::{Poses, Trainer, Validation, validate};

@@ -11,13 +11,14 @@ use upcr::net::NetworkConfig;
 use upcr::{Error, Result, Rigid};
 
 use super::checkpoint::{self, State};
-use super::config::{Length, Mixture, Stage, TrainingConfig};
+use super::config::{Length, Stage, TrainingConfig};
 use super::history::{Event, History, ValidationErrors, Watcher};
 use crate::data::Shapes;
 pub use crate::data::loader::Poses;
 use crate::data::loader::{Example, Loader, Plan, Position, Training};
+use crate::data::pairs::Mixture;
 use crate::eval::metrics::{PoseErrors, Recall, Tolerance};
-use crate::models::weights::{store, TensorFile};
+use crate::models::weights::{TensorFile, store};
 use crate::models::{CloudInput, Clouds, Statistics, Upcr, init};
 use crate::random;
 

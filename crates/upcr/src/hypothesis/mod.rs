@@ -5,11 +5,12 @@ mod fgr;
 mod matching;
 mod prior;
 mod ransac;
+mod upcr;
 
 use matching::are_congruent;
 pub(crate) use matching::{Match, match_levels};
 
-use crate::{prepare::Prepared, settings::Method, transform::Rigid};
+use crate::{net::Network, prepare::Prepared, settings::Method, transform::Rigid};
 
 /// A pose to be refined and verified, in local frames.
 #[derive(Debug, Clone, Copy)]
@@ -28,6 +29,8 @@ pub(crate) struct Problem<'a> {
     pub matches: &'a [Match],
     /// Initial pose in local frames.
     pub init: Rigid,
+    /// The network to ask; the embedded one where none is given.
+    pub network: Option<&'a Network>,
     /// Distance between matched points under a right pose, at most.
     pub tolerance: f32,
     pub seed: u64,
@@ -37,12 +40,16 @@ pub(crate) struct Problem<'a> {
 pub(crate) trait HypothesisSource: Sync {
     fn method(&self) -> Method;
     fn needs_matches(&self) -> bool;
+    /// Probability from which no dearer source is asked.
+    fn sure(&self) -> f64 {
+        0.75
+    }
     fn propose(&self, problem: &Problem) -> Vec<Hypothesis>;
 }
 
 /// Every source, cheapest first.
-pub(crate) const SOURCES: [&dyn HypothesisSource; 4] =
-    [&prior::Prior, &consensus::Consensus, &fgr::Fgr, &ransac::Ransac];
+pub(crate) const SOURCES: [&dyn HypothesisSource; 5] =
+    [&prior::Prior, &upcr::Upcr, &consensus::Consensus, &fgr::Fgr, &ransac::Ransac];
 
 /// Angle and translation between two poses as one length: how far they lay the source's rim apart at most.
 pub(crate) fn separation(a: &Rigid, b: &Rigid, radius: f64) -> f64 {
@@ -118,6 +125,7 @@ mod tests {
                 target: &target,
                 matches: &matches,
                 init: Rigid::identity(),
+                network: None,
                 tolerance: 0.05,
                 seed: 1,
             };
@@ -141,6 +149,7 @@ mod tests {
                 target: &ready,
                 matches: &[],
                 init: Rigid::identity(),
+                network: None,
                 tolerance: 0.05,
                 seed: 1,
             };

@@ -1,7 +1,7 @@
 //! The forward pass of a trained network.
 
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use nalgebra::Vector3;
 
@@ -19,10 +19,18 @@ use crate::transform::Rigid;
 pub struct Network {
     config: NetworkConfig,
     trained: bool,
+    fingerprint: u64,
     global: Vec<GraphLayer>,
     invariant: Option<InvariantBranch>,
     head: Head,
     rooms: Rooms,
+}
+
+/// Networks of the same weights are equal.
+impl PartialEq for Network {
+    fn eq(&self, other: &Self) -> bool {
+        self.fingerprint == other.fingerprint
+    }
 }
 
 /// The branch that sees φ alone.
@@ -78,7 +86,16 @@ impl Network {
         let head = inputs.zip(outputs).enumerate();
         let head = head.map(|(i, (inputs, outputs))| weights.linear(&format!("head.{i}"), inputs, outputs));
         let head = Head::new(head.collect::<Result<Vec<_>>>()?, slope, config.rotation);
-        Ok(Self { trained: weights.trained, config, global, invariant, head, rooms: Rooms::default() })
+        let fingerprint = fnv1a(bytes);
+        Ok(Self {
+            trained: weights.trained,
+            fingerprint,
+            config,
+            global,
+            invariant,
+            head,
+            rooms: Rooms::default(),
+        })
     }
 
     /// From a weights file.
@@ -95,6 +112,25 @@ impl Network {
             }
             other => other,
         })
+    }
+
+    /// The network that is part of the library, trained on shapes (docs/network.md).
+    ///
+    /// # Errors
+    /// None; it has the type of the other ways to a network.
+    pub fn embedded() -> Result<Arc<Self>> {
+        static BYTES: &[u8] = include_bytes!("../../weights/upcr.safetensors");
+        static NETWORK: OnceLock<Arc<Network>> = OnceLock::new();
+        if let Some(network) = NETWORK.get() {
+            return Ok(network.clone());
+        }
+        let network = Arc::new(Self::from_safetensors(BYTES)?);
+        Ok(NETWORK.get_or_init(|| network).clone())
+    }
+
+    /// A number that tells weights apart.
+    pub fn fingerprint(&self) -> u64 {
+        self.fingerprint
     }
 
     /// What the network is made of.
@@ -310,4 +346,11 @@ impl Rooms {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(room);
         result
     }
+}
+
+/// The 64-bit Fowler–Noll–Vo hash (1a), of eight bytes at a time.
+fn fnv1a(bytes: &[u8]) -> u64 {
+    let (words, rest) = bytes.as_chunks::<8>();
+    let words = words.iter().map(|&word| u64::from_le_bytes(word)).chain(rest.iter().map(|&b| u64::from(b)));
+    words.fold(0xcbf2_9ce4_8422_2325, |hash, word| (hash ^ word).wrapping_mul(0x0000_0100_0000_01b3))
 }
