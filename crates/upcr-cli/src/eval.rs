@@ -99,7 +99,7 @@ fn compare(args: &Args) -> Result<ExitCode> {
             for method in &methods {
                 let all = shapes.len();
                 let mut told = |done: usize| {
-                    if done % 16 == 0 {
+                    if done.is_multiple_of(16) {
                         progress.step(&format!("{name}, {}: {done} of {all}", method.name));
                     }
                 };

@@ -1,6 +1,6 @@
 //! The network against a plain form of it in another framework (crates/upcr/tests/golden/README.md).
 #![cfg(feature = "train")]
-#![allow(missing_docs)]
+#![allow(missing_docs, clippy::unwrap_used, clippy::panic)]
 
 use std::path::Path;
 

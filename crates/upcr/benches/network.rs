@@ -1,5 +1,7 @@
 //! Inference of a network of the default size, with random weights, on points scattered over a bumpy torus.
 
+#![allow(clippy::unwrap_used)]
+
 use std::f32::consts::TAU;
 
 use divan::Bencher;

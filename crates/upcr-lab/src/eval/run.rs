@@ -120,8 +120,10 @@ fn estimated(
     method.estimate(source, target, settings).unwrap_or_else(|_| Rigid::identity())
 }
 
-/// Names of a table's columns and how a row fills them.
-const COLUMNS: [(&str, fn(&Row) -> String); 14] = [
+/// A table's column: its name, and how a row fills it.
+type Column = (&'static str, fn(&Row) -> String);
+
+const COLUMNS: [Column; 14] = [
     ("protocol", |r| r.protocol.clone()),
     ("overlap", |r| r.overlap.clone()),
     ("method", |r| r.method.clone()),
@@ -218,7 +220,7 @@ mod tests {
         assert!(row.mae_r_deg < 0.1 && row.rmse_t < 1e-2 && row.me_bregier < 1e-2, "{row:?}");
         assert!(row.ms_per_pair > 0.0);
         assert_eq!((row.protocol.as_str(), row.overlap.as_str(), row.noise), ("upc", "consistent", 0.0));
-        let table = markdown(&[row.clone()]);
+        let table = markdown(std::slice::from_ref(&row));
         assert_eq!(table.lines().count(), 3);
         assert!(table.contains("| default | 3 |"), "{table}");
         let csv = csv(&[row]);
@@ -229,7 +231,7 @@ mod tests {
     #[test]
     fn a_method_that_refuses_counts_as_the_identity() {
         let mut flat = shapes(1);
-        for p in flat.clouds[0].iter_mut() {
+        for p in &mut flat.clouds[0] {
             *p = [p[0], 0.0, 0.0];
         }
         let method = EvaluatedMethod::by_name("icp").unwrap();

@@ -148,7 +148,7 @@ pub fn forward(
         mean: mean.iter().zip(signs(parameters.gamma)).map(|(&m, s)| m as f32 * s).collect(),
         variance: variance.iter().map(|&v| v as f32).collect(),
     };
-    let norm = Norm::new(mean, &variance, parameters);
+    let norm = Norm::new(&mean, &variance, parameters);
     let (largest, winners) = gathered(inputs, &turned, outputs, graph);
     let mut out = vec![0.0; graph.rows() * outputs];
     norm.apply(&largest, parameters.negative_slope, &mut out);
@@ -163,9 +163,10 @@ pub fn forward_with(
     graph: &BatchGraph,
 ) -> Vec<f32> {
     let outputs = parameters.gamma.len();
-    let mean = statistics.mean.iter().zip(signs(parameters.gamma)).map(|(m, s)| f64::from(m * s)).collect();
+    let mean: Vec<f64> =
+        statistics.mean.iter().zip(signs(parameters.gamma)).map(|(m, s)| f64::from(m * s)).collect();
     let variance: Vec<f64> = statistics.variance.iter().map(|&v| f64::from(v)).collect();
-    let norm = Norm::new(mean, &variance, parameters);
+    let norm = Norm::new(&mean, &variance, parameters);
     let (largest, _) = gathered(inputs, &turn(parameters), outputs, graph);
     let mut out = vec![0.0; graph.rows() * outputs];
     norm.apply(&largest, parameters.negative_slope, &mut out);

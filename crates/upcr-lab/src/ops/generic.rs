@@ -2,6 +2,9 @@
 //!
 //! The graph layer has two products a point and no product an edge here too, but its gathered edges are a tensor.
 
+// Tensors are handles, which the framework passes by value.
+#![allow(clippy::needless_pass_by_value)]
+
 use burn::tensor::activation::leaky_relu;
 use burn::tensor::{Device, Int, Tensor, TensorData};
 

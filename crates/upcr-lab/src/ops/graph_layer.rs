@@ -80,7 +80,7 @@ pub(super) struct Norm {
 
 impl Norm {
     /// From the statistics of the values with signs turned.
-    pub fn new(mean: Vec<f64>, variance: &[f64], parameters: &Parameters) -> Self {
+    pub fn new(mean: &[f64], variance: &[f64], parameters: &Parameters) -> Self {
         let deviation_inverse: Vec<f64> =
             variance.iter().map(|v| 1.0 / (v.max(0.0) + EPSILON).sqrt()).collect();
         let scale: Vec<f64> =
@@ -156,7 +156,7 @@ pub fn forward(
         mean: mean.iter().zip(&signs).map(|(&m, s)| m as f32 * s).collect(),
         variance: variance.iter().map(|&v| v as f32).collect(),
     };
-    kept.norm = Norm::new(mean, &variance, parameters);
+    kept.norm = Norm::new(&mean, &variance, parameters);
     let mut out = vec![0.0; graph.rows() * outputs];
     kept.norm.apply(&kept.largest, parameters.negative_slope, &mut out);
     (out, statistics, kept)
@@ -172,9 +172,9 @@ pub fn forward_with(
     let outputs = parameters.gamma.len();
     let folded = fold(parameters);
     let signs = signs(parameters.gamma);
-    let mean = statistics.mean.iter().zip(&signs).map(|(m, s)| f64::from(m * s)).collect();
+    let mean: Vec<f64> = statistics.mean.iter().zip(&signs).map(|(m, s)| f64::from(m * s)).collect();
     let variance: Vec<f64> = statistics.variance.iter().map(|&v| f64::from(v)).collect();
-    let norm = Norm::new(mean, &variance, parameters);
+    let norm = Norm::new(&mean, &variance, parameters);
     let mut out = vec![0.0; graph.rows() * outputs];
     let clouds = graph.split_mut(&mut out, outputs);
     clouds.into_par_iter().enumerate().with_max_len(1).for_each(|(cloud, out)| {

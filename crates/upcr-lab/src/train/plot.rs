@@ -12,6 +12,8 @@ const BLUE: RGBColor = RGBColor(0, 114, 178);
 const ORANGE: RGBColor = RGBColor(230, 159, 0);
 const SIZE: (u32, u32) = (960, 420);
 
+/// A name, a colour, and points (step, value).
+type Line = (&'static str, RGBColor, Vec<(f64, f64)>);
 type Panel<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
 /// Loss and held-out rotation error over the steps, as SVG; empty for a curve without a point.
@@ -53,11 +55,7 @@ pub fn learning_curve(history: &[Event]) -> Result<String> {
 }
 
 /// Lines over the steps, the values' axis logarithmic.
-fn panel(
-    area: &Panel,
-    title: &str,
-    lines: &[(&str, RGBColor, Vec<(f64, f64)>)],
-) -> std::result::Result<(), Box<dyn std::error::Error>> {
+fn panel(area: &Panel, title: &str, lines: &[Line]) -> std::result::Result<(), Box<dyn std::error::Error>> {
     let all = || lines.iter().flat_map(|(_, _, points)| points);
     let last = all().map(|p| p.0).fold(1.0, f64::max);
     let low = all().map(|p| p.1).fold(f64::INFINITY, f64::min);

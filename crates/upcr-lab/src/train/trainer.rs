@@ -245,7 +245,7 @@ impl Trainer {
             self.state.seconds += start.elapsed().as_secs_f64();
 
             let step = self.state.step;
-            let validates = step % config.validation_steps.max(1) == 0 || step == place.end;
+            let validates = step.is_multiple_of(config.validation_steps.max(1)) || step == place.end;
             if validates || since.told.elapsed() >= EVENT_EVERY {
                 let event = Event {
                     step,
