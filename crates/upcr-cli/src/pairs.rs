@@ -23,6 +23,7 @@ pub enum Pairs {
 }
 
 impl Pairs {
+    #[cfg(feature = "train")]
     pub fn mixture(self, partial: bool) -> Vec<(Protocol, f64)> {
         let whole = Protocol::CONSISTENT;
         let [shared, own] = [Protocol::PARTIAL_SHARED, Protocol::PARTIAL_INDEPENDENT];

@@ -151,7 +151,12 @@ impl<'a> Pipeline<'a> {
 
     fn wants(&self, method: Method) -> bool {
         match self.settings.method {
-            Method::Auto => method != Method::Prior || self.settings.init.is_some(),
+            Method::Auto => match method {
+                Method::Prior => self.settings.init.is_some(),
+                // The library's own weights do not pay yet: features are as fast and never wrong where these are.
+                Method::Upcr => self.settings.network.is_some(),
+                _ => true,
+            },
             chosen => chosen == method,
         }
     }

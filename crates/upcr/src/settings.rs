@@ -37,7 +37,7 @@ pub enum Method {
 pub struct Settings {
     /// Where the first pose comes from.
     pub method: Method,
-    /// The network that `Method::Upcr` asks, and `Method::Auto` first; `None`: the one in the library.
+    /// The network that `Method::Auto` asks first; `None`: none. `Method::Upcr` then asks the one in the library.
     #[serde(serialize_with = "fingerprint")]
     pub network: Option<Arc<Network>>,
     /// What the refinement minimises.
