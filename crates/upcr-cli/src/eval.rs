@@ -28,7 +28,7 @@ pub struct Args {
     /// Which part of its points a cloud keeps
     #[arg(long, value_enum, value_delimiter = ',', default_value = "consistent")]
     overlap: Vec<Overlap>,
-    /// Methods: upcr (the network alone, once), upcr+refine, icp, gicp, fgr, consensus, default
+    /// Methods: upcr (the network alone, once), upcr+refine, icp, gicp, fgr, consensus, features, default
     #[arg(long, value_delimiter = ',', default_value = "upcr,upcr+refine,icp,fgr,default")]
     methods: Vec<String>,
     /// Weights of the network [default: those in the program]

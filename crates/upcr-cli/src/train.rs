@@ -43,6 +43,10 @@ pub struct Args {
     /// Settings as TOML, instead of a preset
     #[arg(long, value_name = "FILE", conflicts_with = "preset")]
     config: Option<PathBuf>,
+    /// A setting to change, as in TOML: `--set network.invariant=none`, `--set 'network.widths=[8, 16, 32]'`; may be given
+    /// several times
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    changes: Vec<String>,
     /// Seed of the first weights and of all pairs [default: the settings']
     #[arg(long)]
     seed: Option<u64>,
@@ -56,7 +60,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR", required_unless_present = "resume")]
     out: Option<PathBuf>,
     /// Go on with the run in this folder, as it was started
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["data", "protocol", "partial", "preset", "config", "seed", "out"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["data", "protocol", "partial", "preset", "config", "changes", "seed", "out"])]
     resume: Option<PathBuf>,
 }
 
@@ -64,7 +68,7 @@ pub struct Args {
 enum Preset {
     /// The paper's: 500 epochs of 1,024 points
     Paper,
-    /// Narrower and with fewer points at first: under an hour on two cores
+    /// Narrower and with fewer points at first: minutes on two cores
     Quick,
 }
 
@@ -146,6 +150,9 @@ fn start(args: &Args, device: &upcr_lab::Device) -> Result<(PathBuf, Run, Traine
         (None, Preset::Paper) => TrainingConfig::default(),
         (None, Preset::Quick) => TrainingConfig::quick(),
     };
+    for change in &args.changes {
+        training = training.with(change).with_context(|| format!("--set {change}"))?;
+    }
     training.seed = args.seed.unwrap_or(training.seed);
     if folder.join("checkpoint.safetensors").exists() {
         bail!("{0} holds a run already; go on with it by --resume {0}", folder.display());

@@ -1,5 +1,6 @@
 //! One training step of the paper's network: forward, loss, backward, Adam. Prints a JSON object; the arguments are
-//! pairs, points and repeats. `bench/train_step.py` holds it against a plain PyTorch form.
+//! pairs, points and repeats, then, if wanted, neighbours and by what to divide the widths. `bench/train_step.py` holds
+//! it against a plain PyTorch form.
 #![allow(missing_docs, clippy::print_stdout, clippy::unwrap_used)]
 
 use std::time::Instant;
@@ -14,11 +15,14 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() {
     let numbers: Vec<usize> = std::env::args().filter_map(|arg| arg.parse().ok()).collect();
-    let [pairs, points, repeats] = *numbers else {
-        println!("{{\"usage\": \"train_step PAIRS POINTS REPEATS\"}}");
+    let [pairs, points, repeats, ref narrower @ ..] = *numbers else {
+        println!("{{\"usage\": \"train_step PAIRS POINTS REPEATS [K [DIVISOR]]\"}}");
         return;
     };
-    let config = TrainingConfig::default();
+    let mut config = TrainingConfig::default();
+    config.network.k = narrower.first().copied().unwrap_or(config.network.k);
+    let divisor = narrower.get(1).copied().unwrap_or(1);
+    config.network.widths.iter_mut().chain(&mut config.network.head).for_each(|width| *width /= divisor);
     let mut rng = random::stream(1, 0);
     let mut cloud = || -> Vec<[f32; 3]> {
         (0..points).map(|_| random::direction(&mut rng).map(|v| v as f32).into()).collect()

@@ -36,6 +36,17 @@ const HOLD_OUT_EVERY: u32 = 4;
 /// Clouds of fewer points can spare none.
 const HOLD_OUT_FROM: usize = 100;
 
+/// Whether a registration describes points by features.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Described {
+    /// It does not.
+    Never,
+    /// It may have to, later.
+    Perhaps,
+    /// It does, first of all.
+    Surely,
+}
+
 /// A cloud that passed the checks, with the numbers that later steps need.
 pub(crate) struct Checked<'a> {
     cloud: &'a PointCloud,
@@ -197,8 +208,8 @@ fn spacing(checked: &Checked) -> f64 {
     f64::from(*edges.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
-/// Downsamples to `voxel_size` and, where `features` are wanted, to the resolution that carries them.
-pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Result<Prepared> {
+/// Downsamples to `voxel_size` and, where features are wanted, to the resolution that carries them.
+pub(crate) fn prepare(checked: &Checked, voxel_size: f64, described: Described) -> Result<Prepared> {
     let (cloud, bounds) = (checked.cloud, &checked.bounds);
     if voxel_size < smallest_voxel_size(bounds.diagonal()) {
         return Err(Error::InvalidSetting {
@@ -220,12 +231,12 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Res
         return Ok(Prepared {
             origin,
             diagonal,
-            fine: Level::sparse(points, voxel_size, features),
+            fine: Level::sparse(points, voxel_size, described),
             coarse: None,
         });
     }
-    let separate = features && grid.cells.len() > FEATURE_POINTS;
-    let fine = Level::from_grid(&grid, voxel_size, features && !separate);
+    let separate = described != Described::Never && grid.cells.len() > FEATURE_POINTS;
+    let fine = Level::from_grid(&grid, voxel_size, if separate { Described::Never } else { described });
     let mut coarse = None;
     if separate {
         let mut size = voxel_size;
@@ -233,15 +244,16 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, features: bool) -> Res
             grid = grid.coarsened();
             size *= 2.0;
         }
-        coarse = Some(Level::from_grid(&grid, size, true));
+        coarse = Some(Level::from_grid(&grid, size, described));
     }
     Ok(Prepared { origin, diagonal, fine, coarse })
 }
 
 impl Level {
     /// Every point as it is, normals from its nearest neighbours.
-    fn sparse(points: Vec<[f32; 3]>, voxel_size: f64, features: bool) -> Self {
+    fn sparse(points: Vec<[f32; 3]>, voxel_size: f64, described: Described) -> Self {
         let tree = KdTree::new(&points);
+        let features = described == Described::Surely;
         let graph =
             if features { feature_graph(&tree, voxel_size as f32) } else { tree.knn_graph(NORMAL_NEIGHBORS) };
         let planes = nearest_planes(&points, &graph, NORMAL_NEIGHBORS);
@@ -254,11 +266,11 @@ impl Level {
     }
 
     /// One point a cell, normals from the points in and around it.
-    fn from_grid(grid: &VoxelGrid, voxel_size: f64, features: bool) -> Self {
+    fn from_grid(grid: &VoxelGrid, voxel_size: f64, described: Described) -> Self {
         let points: Vec<[f32; 3]> = grid.cells.iter().map(|c| c.mean().map(|v| v as f32)).collect();
         let total: f64 = grid.cells.iter().map(|c| c.count).sum();
         if total < DENSE_CELL * points.len() as f64 {
-            return Self::sparse(points, voxel_size, features);
+            return Self::sparse(points, voxel_size, described);
         }
         let (tree, normals) = rayon::join(
             || KdTree::new(&points),

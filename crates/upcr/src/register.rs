@@ -10,7 +10,7 @@ use crate::{
     cloud::orient_by_curvature,
     features::{Descriptors, Feature, FeatureInput, Fpfh},
     hypothesis::{Hypothesis, Match, Problem, SOURCES, match_levels, separation},
-    prepare::{Level, Prepared, check, derive_voxel_size, prepare},
+    prepare::{Described, Level, Prepared, check, derive_voxel_size, prepare},
     refine::{Icp, LockedPose, Refined, Refinement, Schedule, factor},
     registration::{Registration, Timings},
     settings::{Method, Settings},
@@ -63,9 +63,14 @@ fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<
         rayon::join(|| check(source, CloudRole::Source), || check(target, CloudRole::Target));
     let (source, target) = (source?, target?);
     let voxel_size = settings.voxel_size.unwrap_or_else(|| derive_voxel_size(&source, &target));
-    let features = settings.method != Method::Prior;
+    let described = match settings.method {
+        Method::Prior => Described::Never,
+        // The network, or a first guess, is asked before.
+        Method::Auto | Method::Upcr => Described::Perhaps,
+        Method::Features | Method::Consensus | Method::Fgr | Method::Ransac => Described::Surely,
+    };
     let (source, target) =
-        rayon::join(|| prepare(&source, voxel_size, features), || prepare(&target, voxel_size, features));
+        rayon::join(|| prepare(&source, voxel_size, described), || prepare(&target, voxel_size, described));
     let (source, target) = (source?, target?);
     let mut pipeline = Pipeline::new(&source, &target, voxel_size, settings);
     pipeline.timings.prepare = milliseconds(start);
@@ -121,7 +126,7 @@ impl<'a> Pipeline<'a> {
                 self.matches = self.feature_matches()?;
             }
             let coarse = self.source.coarse().voxel_size.max(self.target.coarse().voxel_size);
-            let hypotheses = source.propose(&Problem {
+            let problem = Problem {
                 source: self.source,
                 target: self.target,
                 matches: &self.matches,
@@ -129,10 +134,14 @@ impl<'a> Pipeline<'a> {
                 network: self.settings.network.as_deref(),
                 tolerance: TOLERANCE_VOXELS * coarse,
                 seed: self.settings.seed,
-            });
+                alone: self.settings.method == source.method(),
+            };
+            let hypotheses = source.propose(&problem);
             self.timings.hypotheses += milliseconds(start);
             let start = Instant::now();
-            self.refine_hypotheses(&hypotheses);
+            let refined = self.refined(&hypotheses, |best| source.alternatives(&problem, best));
+            self.candidates.extend(refined);
+            self.candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
             self.timings.refine += milliseconds(start);
             let start = Instant::now();
             let registration = self.verified();
@@ -151,12 +160,8 @@ impl<'a> Pipeline<'a> {
 
     fn wants(&self, method: Method) -> bool {
         match self.settings.method {
-            Method::Auto => match method {
-                Method::Prior => self.settings.init.is_some(),
-                // The library's own weights do not pay yet: features are as fast and never wrong where these are.
-                Method::Upcr => self.settings.network.is_some(),
-                _ => true,
-            },
+            Method::Auto => method != Method::Prior || self.settings.init.is_some(),
+            Method::Features => matches!(method, Method::Consensus | Method::Fgr | Method::Ransac),
             chosen => chosen == method,
         }
     }
@@ -178,26 +183,42 @@ impl<'a> Pipeline<'a> {
         }
     }
 
-    /// Ranks hypotheses by overlap, refines the best coarsely, ranks again, refines the best of those finely.
-    fn refine_hypotheses(&mut self, hypotheses: &[Hypothesis]) {
+    /// Ranks hypotheses by overlap, refines the best coarsely, ranks again, beside the `alternatives` to the best, and
+    /// refines the best of those finely.
+    fn refined(
+        &self,
+        hypotheses: &[Hypothesis],
+        alternatives: impl FnOnce(&Rigid) -> Vec<Hypothesis>,
+    ) -> Vec<Candidate> {
         let (source, target) = (self.source.coarse(), self.target.coarse());
         let limit = REACH_VOXELS * source.voxel_size.max(target.voxel_size);
         let rank = |pose: &Rigid, points: usize| overlap_at(source, target, pose, points, limit).score(2);
-        let mut ranked: Vec<(f64, Hypothesis)> =
-            hypotheses.par_iter().map(|h| (rank(&h.pose, RANKING_POINTS), *h)).collect();
-        keep_promising(&mut ranked, COARSE_CANDIDATES);
-        if self.settings.refine != Refinement::None {
+        let promising = |hypotheses: &[Hypothesis], least: f64| {
+            let mut ranked: Vec<(f64, Hypothesis)> =
+                hypotheses.par_iter().map(|h| (rank(&h.pose, RANKING_POINTS), *h)).collect();
+            ranked.retain(|&(score, _)| score >= least);
+            keep_promising(&mut ranked, COARSE_CANDIDATES);
+            ranked
+        };
+        let moved = source.spread(COARSE_POINTS);
+        let coarsely_refined = |ranked: Vec<(f64, Hypothesis)>| {
+            if self.settings.refine == Refinement::None {
+                return ranked;
+            }
             let icp = self.icp(source, target);
-            let moved = source.spread(COARSE_POINTS);
-            ranked = ranked
-                .par_iter()
-                .map(|(_, h)| {
-                    let pose = icp.refine(&moved, &h.pose, &Schedule::coarse(limit)).pose;
-                    (rank(&pose, COMPARING_POINTS), Hypothesis { pose, ..*h })
-                })
-                .collect();
-        }
+            let refined = ranked.par_iter().map(|(_, h)| {
+                let pose = icp.refine(&moved, &h.pose, &Schedule::coarse(limit)).pose;
+                (rank(&pose, COMPARING_POINTS), Hypothesis { pose, ..*h })
+            });
+            refined.collect()
+        };
+        let mut ranked = coarsely_refined(promising(hypotheses, 0.0));
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        if let Some((score, best)) = ranked.first() {
+            let others = promising(&alternatives(&best.pose), PROMISING * score);
+            ranked.extend(coarsely_refined(others));
+            ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        }
         let radius = f64::from(self.source.fine.radius);
         let mut distinct: Vec<(f64, Hypothesis)> = Vec::new();
         for (score, h) in ranked {
@@ -206,9 +227,7 @@ impl<'a> Pipeline<'a> {
             }
         }
         keep_promising(&mut distinct, FINE_CANDIDATES);
-        let refined: Vec<Candidate> = distinct.iter().map(|(_, h)| self.finely_refined(h)).collect();
-        self.candidates.extend(refined);
-        self.candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
+        distinct.iter().map(|(_, h)| self.finely_refined(h)).collect()
     }
 
     fn finely_refined(&self, hypothesis: &Hypothesis) -> Candidate {

@@ -17,9 +17,12 @@ use crate::{
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
 pub enum Method {
-    /// Cheap sources first, dearer ones until the verifier is sure.
+    /// Cheap sources first, dearer ones until the verifier is sure: the initial pose, where one is given, the network,
+    /// then features.
     #[default]
     Auto,
+    /// Sources that match features, cheap ones first: consensus, FGR, RANSAC.
+    Features,
     /// The given initial pose alone (identity where none is given).
     Prior,
     /// The UPCR network.
@@ -37,7 +40,7 @@ pub enum Method {
 pub struct Settings {
     /// Where the first pose comes from.
     pub method: Method,
-    /// The network that `Method::Auto` asks first; `None`: none. `Method::Upcr` then asks the one in the library.
+    /// The network that is asked; `None`: the one in the library.
     #[serde(serialize_with = "fingerprint")]
     pub network: Option<Arc<Network>>,
     /// What the refinement minimises.

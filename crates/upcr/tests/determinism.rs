@@ -23,8 +23,15 @@ fn answer(pair: &Pair, method: Method, threads: usize) -> String {
 #[test]
 fn threads_and_runs_do_not_matter() {
     let pair = Pair::sample(2);
-    for method in [Method::Auto, Method::Prior, Method::Upcr, Method::Fgr, Method::Ransac, Method::Consensus]
-    {
+    for method in [
+        Method::Auto,
+        Method::Features,
+        Method::Prior,
+        Method::Upcr,
+        Method::Fgr,
+        Method::Ransac,
+        Method::Consensus,
+    ] {
         let first = answer(&pair, method, 1);
         for threads in [1, 2, 3, 2] {
             assert_eq!(answer(&pair, method, threads), first, "{method:?} on {threads} threads");

@@ -12,7 +12,8 @@ use upcr::{
 };
 
 /// Methods that find any pose. The network, alone, knows the turns that it learned: it has a test of its own.
-const METHODS: [Method; 5] = [Method::Auto, Method::Prior, Method::Fgr, Method::Ransac, Method::Consensus];
+const METHODS: [Method; 6] =
+    [Method::Auto, Method::Features, Method::Prior, Method::Fgr, Method::Ransac, Method::Consensus];
 const REFINEMENTS: [Refinement; 4] =
     [Refinement::Gicp, Refinement::Plane, Refinement::Point, Refinement::None];
 
@@ -78,7 +79,7 @@ fn mistakes(pair: &Pair, settings: &Settings) -> (Registration, Vec<String>) {
     if settings.refine != Refinement::None && !found.is_trustworthy() {
         wrong.push(format!("{case}: probability {:.3}, {:?}", found.probability, found.reasons));
     }
-    if settings.method != Method::Auto && found.method != settings.method {
+    if !matches!(settings.method, Method::Auto | Method::Features) && found.method != settings.method {
         wrong.push(format!("{case}: found by {:?}", found.method));
     }
     if !found.is_trustworthy() && found.reasons.is_empty() {

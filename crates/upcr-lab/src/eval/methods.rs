@@ -12,13 +12,14 @@ pub struct EvaluatedMethod {
 }
 
 /// Every method there is. A new one is a line here.
-pub const METHODS: [EvaluatedMethod; 7] = [
+pub const METHODS: [EvaluatedMethod; 8] = [
     EvaluatedMethod { name: "upcr", estimate: one_pass },
     EvaluatedMethod { name: "upcr+refine", estimate: one_pass_refined },
     EvaluatedMethod { name: "icp", estimate: icp },
     EvaluatedMethod { name: "gicp", estimate: gicp },
     EvaluatedMethod { name: "fgr", estimate: fgr },
     EvaluatedMethod { name: "consensus", estimate: consensus },
+    EvaluatedMethod { name: "features", estimate: features },
     EvaluatedMethod { name: "default", estimate: default },
 ];
 
@@ -80,6 +81,12 @@ fn fgr(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<
 /// Feature matches that agree with each other, and the default refinement from there.
 fn consensus(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
     let settings = Settings { method: Method::Consensus, ..settings.clone() };
+    Ok(register(source, target, &settings)?.T_target_source)
+}
+
+/// What `register` does without the network.
+fn features(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
+    let settings = Settings { method: Method::Features, ..settings.clone() };
     Ok(register(source, target, &settings)?.T_target_source)
 }
 

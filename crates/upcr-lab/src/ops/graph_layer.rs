@@ -10,10 +10,13 @@ use rayon::prelude::*;
 
 use super::batch::{BatchGraph, CloudGraph};
 use super::buffer::Buffer;
-use super::product::{Matrix, product};
+use super::product::{Matrix, product, product_with_stride};
 
 /// Added to variances (as PyTorch and burn do by default).
 pub const EPSILON: f64 = 1e-5;
+/// Values between two rows of [A | B]. Channels are worked on in blocks, over all rows: rows a power of two apart would
+/// share few places in the cache.
+const GAP: usize = 16;
 /// Sums over clouds are formed in so many parts, whatever the number of threads.
 const PARTS: usize = 16;
 
@@ -42,12 +45,11 @@ pub struct EdgeStatistics {
 /// What the gradients need of the values.
 #[derive(Debug, Default)]
 pub struct Kept {
-    /// [A | B] of every row, signs turned.
-    products: Buffer<f32>,
-    /// Aᵢ + maxⱼ Bⱼ.
+    /// Aᵢ + maxⱼ Bⱼ of every row, signs turned.
     largest: Buffer<f32>,
-    /// Σⱼ v of every row.
-    sums: Buffer<f32>,
+    /// Σ v over the edges that leave a row, and over those that come to it.
+    leaving: Buffer<f32>,
+    coming: Buffer<f32>,
     /// The neighbour, by its place in the row, that has the maximum.
     winners: Buffer<u8>,
     /// [W₁ - W₂ | W₂] with signs turned, `[inputs, 2 · outputs]`.
@@ -127,26 +129,26 @@ pub fn forward(
 ) -> (Vec<f32>, EdgeStatistics, Kept) {
     let outputs = parameters.gamma.len();
     let mut kept = Kept {
-        products: Buffer::new(graph.rows() * 2 * outputs),
         largest: Buffer::new(graph.rows() * outputs),
-        sums: Buffer::new(graph.rows() * outputs),
+        leaving: Buffer::new(graph.rows() * outputs),
+        coming: Buffer::new(graph.rows() * outputs),
         winners: Buffer::new(graph.rows() * outputs),
         folded: fold(parameters),
         norm: Norm::default(),
     };
     let folded = &kept.folded;
     let totals: Vec<Vec<f32>> = graph
-        .split_mut(&mut kept.products, 2 * outputs)
+        .split_mut(&mut kept.largest, outputs)
         .into_par_iter()
-        .zip(graph.split_mut(&mut kept.largest, outputs))
-        .zip(graph.split_mut(&mut kept.sums, outputs))
+        .zip(graph.split_mut(&mut kept.leaving, outputs))
+        .zip(graph.split_mut(&mut kept.coming, outputs))
         .zip(graph.split_mut(&mut kept.winners, outputs))
         .enumerate()
         .with_max_len(1)
-        .map(|(cloud, (((products, largest), sums), winners))| {
-            point_products(features, graph, cloud, folded, products);
+        .map(|(cloud, (((largest, leaving), coming), winners))| {
             let mut totals = vec![0.0; 2 * outputs];
-            gather(&graph.view(cloud), products, largest, sums, winners, &mut totals);
+            let gathered = Gathered { largest, leaving, coming, winners, totals: &mut totals };
+            gather(&graph.view(cloud), &point_products(features, graph, cloud, folded), gathered);
             totals
         })
         .collect();
@@ -178,19 +180,9 @@ pub fn forward_with(
     let mut out = vec![0.0; graph.rows() * outputs];
     let clouds = graph.split_mut(&mut out, outputs);
     clouds.into_par_iter().enumerate().with_max_len(1).for_each(|(cloud, out)| {
-        let rows = graph.cloud(cloud).len();
-        let mut products = Buffer::new(rows * 2 * outputs);
-        point_products(features, graph, cloud, &folded, &mut products);
-        let mut largest = Buffer::new(rows * outputs);
-        let (mut sums, mut winners) = (Buffer::new(rows * outputs), Buffer::new(rows * outputs));
-        gather(
-            &graph.view(cloud),
-            &products,
-            &mut largest,
-            &mut sums,
-            &mut winners,
-            &mut vec![0.0; 2 * outputs],
-        );
+        let products = point_products(features, graph, cloud, &folded);
+        let mut largest = Buffer::new(out.len());
+        gather_largest(&graph.view(cloud), &products, outputs, &mut largest);
         normalize(&largest, &norm.scale, &norm.shift, parameters.negative_slope, out);
     });
     out
@@ -257,18 +249,16 @@ pub fn backward(
                 let cloud = part * clouds_a_part + cloud;
                 let rows = graph.cloud(cloud);
                 let of = |width: usize| rows.start * width..rows.end * width;
-                let mut grad_products = Buffer::new(rows.len() * 2 * outputs);
-                scatter(
+                let mut grad_products = Buffer::new(rows.len() * stride(outputs));
+                spread(
                     &graph.view(cloud),
-                    &kept.products[of(2 * outputs)],
-                    &kept.sums[of(outputs)],
-                    &kept.winners[of(outputs)],
-                    &winning[of(outputs)],
-                    &share,
-                    &slope,
+                    [&kept.leaving[of(outputs)], &kept.coming[of(outputs)]],
+                    [&share, &slope],
                     &mut grad_products,
                 );
-                let gradient = Matrix::rows(&grad_products, 2 * outputs);
+                let (winners, winning) = (&kept.winners[of(outputs)], &winning[of(outputs)]);
+                award(&graph.view(cloud), winners, winning, outputs, &mut grad_products);
+                let gradient = Matrix::rows(&grad_products, stride(outputs));
                 if let Some(grad_features) = grad_features {
                     let folded = Matrix::rows(&kept.folded, 2 * outputs).transposed();
                     product([rows.len(), 2 * outputs, inputs], gradient, folded, grad_features, false);
@@ -326,13 +316,29 @@ fn fold(parameters: &Parameters) -> Vec<f32> {
     folded
 }
 
+/// From a row of [A | B] to the next.
+#[inline(always)]
+fn stride(outputs: usize) -> usize {
+    2 * outputs + GAP
+}
+
 /// [A | B] of a cloud.
-fn point_products(features: &[f32], graph: &BatchGraph, cloud: usize, folded: &[f32], products: &mut [f32]) {
+fn point_products(features: &[f32], graph: &BatchGraph, cloud: usize, folded: &[f32]) -> Buffer<f32> {
     let rows = graph.cloud(cloud);
     let inputs = features.len() / graph.rows();
     let width = folded.len() / inputs;
     let features = Matrix::rows(&features[rows.start * inputs..rows.end * inputs], inputs);
-    product([rows.len(), inputs, width], features, Matrix::rows(folded, width), products, false);
+    let mut products = Buffer::new(rows.len() * stride(width / 2));
+    let sizes = [rows.len(), inputs, width];
+    product_with_stride(
+        sizes,
+        features,
+        Matrix::rows(folded, width),
+        &mut products,
+        stride(width / 2),
+        false,
+    );
+    products
 }
 
 /// Sums of all clouds, in their order.
@@ -353,91 +359,143 @@ fn moments(totals: &[Vec<f32>], edges: usize) -> (Vec<f64>, Vec<f64>) {
     (mean, variance)
 }
 
-/// For a cloud's [A | B]: the largest v of every row, its place, and Σ v; `totals` are Σ v and Σ v² over all edges.
+/// Places for what is gathered over a cloud's edges.
+struct Gathered<'a> {
+    largest: &'a mut [f32],
+    leaving: &'a mut [f32],
+    coming: &'a mut [f32],
+    winners: &'a mut [u8],
+    /// Σ v and Σ v² over all edges.
+    totals: &'a mut [f32],
+}
+
+/// Gathers over the edges of a cloud with the products [A | B].
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2"))]
-fn gather(
-    graph: &CloudGraph,
-    products: &[f32],
-    largest: &mut [f32],
-    sums: &mut [f32],
-    winners: &mut [u8],
-    totals: &mut [f32],
-) {
-    let outputs = totals.len() / 2;
+fn gather(graph: &CloudGraph, products: &[f32], mut gathered: Gathered) {
+    let outputs = gathered.totals.len() / 2;
     let mut first = 0;
     while first + 32 <= outputs {
-        gather_block::<32>(graph, products, first, largest, sums, winners, totals);
+        gather_block::<32>(graph, products, first, &mut gathered);
         first += 32;
     }
     while first + 16 <= outputs {
-        gather_block::<16>(graph, products, first, largest, sums, winners, totals);
+        gather_block::<16>(graph, products, first, &mut gathered);
         first += 16;
     }
     while first + 8 <= outputs {
-        gather_block::<8>(graph, products, first, largest, sums, winners, totals);
+        gather_block::<8>(graph, products, first, &mut gathered);
         first += 8;
     }
     while first < outputs {
-        gather_block::<1>(graph, products, first, largest, sums, winners, totals);
+        gather_block::<1>(graph, products, first, &mut gathered);
         first += 1;
+    }
+}
+
+/// The largest values alone.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2"))]
+fn gather_largest(graph: &CloudGraph, products: &[f32], outputs: usize, largest: &mut [f32]) {
+    let mut first = 0;
+    while first + 16 <= outputs {
+        largest_block::<16>(graph, products, outputs, first, largest);
+        first += 16;
+    }
+    while first < outputs {
+        largest_block::<1>(graph, products, outputs, first, largest);
+        first += 1;
+    }
+}
+
+#[inline(always)]
+fn largest_block<const N: usize>(
+    graph: &CloudGraph,
+    products: &[f32],
+    outputs: usize,
+    first: usize,
+    largest: &mut [f32],
+) {
+    for i in 0..graph.rows() {
+        let mut best = [f32::NEG_INFINITY; N];
+        for &j in graph.row(i) {
+            let b = lanes::<N>(products, j as usize * stride(outputs) + outputs + first);
+            let mut next = [0.0; N];
+            for c in 0..N {
+                next[c] = if b[c] > best[c] { b[c] } else { best[c] };
+            }
+            best = next;
+        }
+        store(add(lanes(products, i * stride(outputs) + first), best), largest, i * outputs + first);
     }
 }
 
 /// The `N` values from `at` on.
 #[inline(always)]
-fn lanes<const N: usize>(values: &[f32], at: usize) -> &[f32; N] {
-    match values[at..].first_chunk() {
-        Some(lanes) => lanes,
-        None => &[0.0; N],
+fn lanes<const N: usize>(values: &[f32], at: usize) -> [f32; N] {
+    values[at..].first_chunk().copied().unwrap_or([0.0; N])
+}
+
+/// Writes the `N` values from `at` on.
+#[inline(always)]
+fn store<const N: usize, T: Copy>(lanes: [T; N], values: &mut [T], at: usize) {
+    if let Some(place) = values[at..].first_chunk_mut() {
+        *place = lanes;
     }
 }
 
+/// New arrays throughout: what is written in place goes through memory and is several times slower.
 #[inline(always)]
-fn gather_block<const N: usize>(
-    graph: &CloudGraph,
-    products: &[f32],
-    first: usize,
-    largest: &mut [f32],
-    sums: &mut [f32],
-    winners: &mut [u8],
-    totals: &mut [f32],
-) {
-    let outputs = totals.len() / 2;
-    let width = 2 * outputs;
+fn add<const N: usize>(a: [f32; N], b: [f32; N]) -> [f32; N] {
+    let mut sum = [0.0; N];
+    for c in 0..N {
+        sum[c] = a[c] + b[c];
+    }
+    sum
+}
+
+#[inline(always)]
+fn gather_block<const N: usize>(graph: &CloudGraph, products: &[f32], first: usize, gathered: &mut Gathered) {
+    let outputs = gathered.totals.len() / 2;
+    let width = stride(outputs);
     let k = graph.k as f32;
     let (mut total, mut total_sq) = ([0.0; N], [0.0; N]);
     for i in 0..graph.rows() {
-        let mut best = [f32::NEG_INFINITY; N];
-        let mut winner = [0_i32; N];
-        let mut sum = [0.0; N];
+        let (mut best, mut winner, mut sum) = ([f32::NEG_INFINITY; N], [0_i32; N], [0.0; N]);
         for (place, &j) in (0_i32..).zip(graph.row(i)) {
             let b = lanes::<N>(products, j as usize * width + outputs + first);
-            // New arrays: written in place, `best` would go through memory and be five times slower.
             let (mut next_best, mut next_winner) = ([0.0; N], [0; N]);
             for c in 0..N {
                 let larger = b[c] > best[c];
                 next_best[c] = if larger { b[c] } else { best[c] };
                 next_winner[c] = if larger { place } else { winner[c] };
-                sum[c] += b[c];
             }
-            (best, winner) = (next_best, next_winner);
+            (best, winner, sum) = (next_best, next_winner, add(sum, b));
         }
+        let sources = graph.sources(i);
+        let mut from = [0.0; N];
+        for &i in sources {
+            from = add(from, lanes(products, i as usize * width + first));
+        }
+        let uses = sources.len() as f32;
         let a = lanes::<N>(products, i * width + first);
         let b = lanes::<N>(products, i * width + outputs + first);
-        let uses = graph.sources(i).len() as f32;
-        let at = i * outputs + first;
+        let (mut leaving, mut coming) = ([0.0; N], [0.0; N]);
+        let (mut squares, mut places) = ([0.0; N], [0_u8; N]);
         for c in 0..N {
-            let edge_sum = k * a[c] + sum[c];
-            total[c] += edge_sum;
+            leaving[c] = k * a[c] + sum[c];
+            coming[c] = uses * b[c] + from[c];
             // Σⱼ (Aᵢ + Bⱼ)² = Aᵢ (Σⱼ v + Σⱼ Bⱼ) + Σⱼ Bⱼ², the last counted where the neighbour stands.
-            total_sq[c] += a[c] * (edge_sum + sum[c]) + uses * b[c] * b[c];
-            largest[at + c] = a[c] + best[c];
-            sums[at + c] = edge_sum;
-            winners[at + c] = winner[c] as u8;
+            squares[c] = a[c] * (leaving[c] + sum[c]) + uses * b[c] * b[c];
+            places[c] = winner[c] as u8;
         }
+        (total, total_sq) = (add(total, leaving), add(total_sq, squares));
+        let at = i * outputs + first;
+        store(add(a, best), gathered.largest, at);
+        store(leaving, gathered.leaving, at);
+        store(coming, gathered.coming, at);
+        store(places, gathered.winners, at);
     }
-    totals[first..first + N].copy_from_slice(&total);
-    totals[outputs + first..outputs + first + N].copy_from_slice(&total_sq);
+    store(total, gathered.totals, first);
+    store(total_sq, gathered.totals, outputs + first);
 }
 
 /// Gradients of a cloud's largest values, back through rectifier and norm's scale; `totals` are the sums, over the
@@ -452,125 +510,64 @@ pub(super) fn through_rectifier(
     totals: &mut [f32],
 ) {
     let outputs = norm.scale.len();
-    let mut first = 0;
-    while first + 16 <= outputs {
-        rectifier_block::<16>(largest, grad_out, norm, negative_slope, first, winning, totals);
-        first += 16;
-    }
-    while first < outputs {
-        rectifier_block::<1>(largest, grad_out, norm, negative_slope, first, winning, totals);
-        first += 1;
-    }
-}
-
-#[inline(always)]
-fn rectifier_block<const N: usize>(
-    largest: &[f32],
-    grad_out: &[f32],
-    norm: &Norm,
-    negative_slope: f32,
-    first: usize,
-    winning: &mut [f32],
-    totals: &mut [f32],
-) {
-    let outputs = norm.scale.len();
-    let (scale, shift) = (*lanes::<N>(&norm.scale, first), *lanes::<N>(&norm.shift, first));
-    let mean = *lanes::<N>(&norm.mean, first);
-    let (mut sums, mut products) = ([0.0; N], [0.0; N]);
-    for (i, winning) in winning.chunks_exact_mut(outputs).enumerate() {
-        let value = lanes::<N>(largest, i * outputs + first);
-        let grad_out = lanes::<N>(grad_out, i * outputs + first);
-        let Some(winning) = winning[first..].first_chunk_mut::<N>() else { continue };
-        for c in 0..N {
-            let positive = value[c] * scale[c] + shift[c] > 0.0;
+    let (sums, products) = totals.split_at_mut(outputs);
+    let rows = largest.chunks_exact(outputs).zip(grad_out.chunks_exact(outputs));
+    for (winning, (largest, grad_out)) in winning.chunks_exact_mut(outputs).zip(rows) {
+        let (scale, shift, mean) = (&norm.scale[..outputs], &norm.shift[..outputs], &norm.mean[..outputs]);
+        for c in 0..outputs {
+            let positive = largest[c] * scale[c] + shift[c] > 0.0;
             let gradient = grad_out[c] * if positive { 1.0 } else { negative_slope };
             sums[c] += gradient;
-            products[c] += gradient * (value[c] - mean[c]);
+            products[c] += gradient * (largest[c] - mean[c]);
             winning[c] = gradient * scale[c];
         }
     }
-    totals[first..first + N].copy_from_slice(&sums);
-    totals[outputs + first..outputs + first + N].copy_from_slice(&products);
 }
 
-/// Gradients of a cloud's [A | B]: to the winner what its maximum is worth, to every edge -(share + slope · v).
+/// What every edge's gradient has from the norm, -(share + slope · v), summed for A and B of a cloud's rows.
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2"))]
-#[allow(clippy::too_many_arguments)] // slices of one cloud and one layer
-fn scatter(
+fn spread(
     graph: &CloudGraph,
-    products: &[f32],
-    sums: &[f32],
-    winners: &[u8],
-    winning: &[f32],
-    share: &[f32],
-    slope: &[f32],
+    [leaving, coming]: [&[f32]; 2],
+    [share, slope]: [&[f32]; 2],
     grad_products: &mut [f32],
 ) {
     let outputs = share.len();
-    let mut first = 0;
-    while first + 32 <= outputs {
-        spread_block::<32>(graph, products, first, share, slope, grad_products);
-        first += 32;
+    for (j, row) in grad_products.chunks_exact_mut(stride(outputs)).enumerate() {
+        let (own, other) = row[..2 * outputs].split_at_mut(outputs);
+        let sums = j * outputs..(j + 1) * outputs;
+        for (grad, sums, edges) in
+            [(own, &leaving[sums.clone()], graph.k), (other, &coming[sums], graph.sources(j).len())]
+        {
+            for (((grad, sum), share), slope) in grad.iter_mut().zip(sums).zip(share).zip(slope) {
+                *grad = -(edges as f32 * share) - slope * sum;
+            }
+        }
     }
-    while first + 16 <= outputs {
-        spread_block::<16>(graph, products, first, share, slope, grad_products);
-        first += 16;
-    }
-    while first + 8 <= outputs {
-        spread_block::<8>(graph, products, first, share, slope, grad_products);
-        first += 8;
-    }
-    while first < outputs {
-        spread_block::<1>(graph, products, first, share, slope, grad_products);
-        first += 1;
-    }
-    let k = graph.k as f32;
+}
+
+/// Adds the gradients of a cloud's largest values, where A and the winner's B take part.
+#[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2"))]
+fn award(graph: &CloudGraph, winners: &[u8], winning: &[f32], outputs: usize, grad_products: &mut [f32]) {
     // Where the rows of B of a point's neighbours start; a place among the neighbours is a byte.
     let mut starts = [0_usize; 256];
     for i in 0..graph.rows() {
-        let at = i * outputs..(i + 1) * outputs;
-        let (sums, winning, winners) = (&sums[at.clone()], &winning[at.clone()], &winners[at]);
-        let own = &mut grad_products[i * 2 * outputs..i * 2 * outputs + outputs];
-        for c in 0..outputs {
-            own[c] = winning[c] - k * share[c] - slope[c] * sums[c];
-        }
         for (start, &j) in starts.iter_mut().zip(graph.row(i)) {
-            *start = j as usize * 2 * outputs + outputs;
+            *start = j as usize * stride(outputs) + outputs;
         }
-        for (c, (&winner, gradient)) in winners.iter().zip(winning).enumerate() {
-            grad_products[starts[winner as usize] + c] += gradient;
-        }
-    }
-}
-
-/// The share of B's gradient that comes from the norm's mean and variance.
-#[inline(always)]
-fn spread_block<const N: usize>(
-    graph: &CloudGraph,
-    products: &[f32],
-    first: usize,
-    share: &[f32],
-    slope: &[f32],
-    grad_products: &mut [f32],
-) {
-    let outputs = share.len();
-    let width = 2 * outputs;
-    let (share, slope) = (*lanes::<N>(share, first), *lanes::<N>(slope, first));
-    for j in 0..graph.rows() {
-        let sources = graph.sources(j);
-        let mut sum = [0.0; N];
-        for &i in sources {
-            let a = lanes::<N>(products, i as usize * width + first);
-            for c in 0..N {
-                sum[c] += a[c];
+        let at = i * outputs;
+        let own = &mut grad_products[i * stride(outputs)..][..outputs];
+        own.iter_mut().zip(&winning[at..]).for_each(|(own, winning)| *own += winning);
+        for first in (0..outputs).step_by(16) {
+            let range = at + first..at + outputs.min(first + 16);
+            let (winning, winners) = (&winning[range.clone()], &winners[range]);
+            // Behind a maximum over all points, most points have nothing to give.
+            if winning.iter().fold(0, |bits, w| bits | w.to_bits()) << 1 == 0 {
+                continue;
             }
-        }
-        let uses = sources.len() as f32;
-        let at = j * width + outputs + first;
-        let b = lanes::<N>(products, at);
-        for c in 0..N {
-            let edge_sum = uses * b[c] + sum[c];
-            grad_products[at + c] = -(uses * share[c]) - slope[c] * edge_sum;
+            for (c, (&winner, gradient)) in (first..).zip(winners.iter().zip(winning)) {
+                grad_products[starts[winner as usize] + c] += gradient;
+            }
         }
     }
 }

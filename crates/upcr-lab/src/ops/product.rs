@@ -24,14 +24,21 @@ impl<'a> Matrix<'a> {
 }
 
 /// `out = left · right`, or `out += …`, with `out` of `rows` × `columns`, row by row.
-pub(super) fn product(
+pub(super) fn product(sizes: [usize; 3], left: Matrix, right: Matrix, out: &mut [f32], accumulate: bool) {
+    product_with_stride(sizes, left, right, out, sizes[2], accumulate);
+}
+
+/// The same with rows of `out` that start `stride` values apart.
+pub(super) fn product_with_stride(
     [rows, inner, columns]: [usize; 3],
     left: Matrix,
     right: Matrix,
     out: &mut [f32],
+    stride: usize,
     accumulate: bool,
 ) {
-    assert!(left.holds(rows, inner) && right.holds(inner, columns) && out.len() >= rows * columns);
+    assert!(left.holds(rows, inner) && right.holds(inner, columns) && columns <= stride);
+    assert!(rows == 0 || out.len() >= (rows - 1) * stride + columns);
     // SAFETY: all entries lie in their slices, as asserted, and `out` is borrowed alone.
     unsafe {
         gemm::gemm(
@@ -40,7 +47,7 @@ pub(super) fn product(
             inner,
             out.as_mut_ptr(),
             1,
-            columns as isize,
+            stride as isize,
             accumulate,
             left.values.as_ptr(),
             left.column as isize,

@@ -83,13 +83,13 @@ impl Default for TrainingConfig {
 }
 
 impl TrainingConfig {
-    /// A useful model in under an hour of two cores: a quarter of the width, and few points but at the end.
+    /// A useful model in minutes of two cores: a quarter of the width, and few points but at the end.
     pub fn quick() -> Self {
         Self {
             stages: vec![
-                Stage { points: 256, k: Some(8), batch: 26, length: Length::Steps(15_000) },
-                Stage { points: 512, k: Some(14), batch: 26, length: Length::Steps(700) },
-                Stage { points: 1024, k: None, batch: 26, length: Length::Steps(300) },
+                Stage { points: 256, k: Some(8), batch: 26, length: Length::Steps(6000) },
+                Stage { points: 512, k: Some(14), batch: 26, length: Length::Steps(300) },
+                Stage { points: 1024, k: None, batch: 26, length: Length::Steps(150) },
             ],
             learning_rate: 2e-3,
             decay: Decay::Cosine,
@@ -113,6 +113,22 @@ impl TrainingConfig {
             .map_err(|e| Error::InvalidSetting { name: "config", reason: e.to_string() })?;
         config.check()?;
         Ok(config)
+    }
+
+    /// The same with one setting changed: `KEY=VALUE` as in the file form, dots between a table and its keys; a word
+    /// needs no quotes.
+    ///
+    /// # Errors
+    /// Where there is no such setting, or the configuration cannot be run.
+    pub fn with(&self, change: &str) -> Result<Self> {
+        let refused = |reason: String| Error::InvalidSetting { name: "config", reason };
+        let (key, value) = change.split_once('=').ok_or_else(|| refused("KEY=VALUE is wanted".into()))?;
+        let changed = toml::from_str::<toml::Table>(change)
+            .or_else(|_| toml::from_str(&format!("{key} = {:?}", value.trim())))
+            .map_err(|e| refused(e.to_string()))?;
+        let mut table: toml::Table = toml::from_str(&self.to_toml()).map_err(|e| refused(e.to_string()))?;
+        merge(&mut table, changed);
+        Self::from_toml(&toml::to_string(&table).unwrap_or_default())
     }
 
     /// The file form.
@@ -156,6 +172,16 @@ impl TrainingConfig {
     }
 }
 
+/// Puts the values of `changed` in the place of those of `table`, keeping the others.
+fn merge(table: &mut toml::Table, changed: toml::Table) {
+    for (key, value) in changed {
+        match (table.get_mut(&key), value) {
+            (Some(toml::Value::Table(inner)), toml::Value::Table(changed)) => merge(inner, changed),
+            (_, value) => drop(table.insert(key, value)),
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -181,6 +207,19 @@ mod tests {
             "[network]\ninvariant = \"colour\"",
         ] {
             assert!(TrainingConfig::from_toml(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn single_settings_change_and_the_others_stay() {
+        let quick = TrainingConfig::quick();
+        let whole = quick.with("network.invariant=none").unwrap();
+        assert_eq!(whole.network.invariant, upcr::net::Invariant::None);
+        assert_eq!((&whole.stages, &whole.network.widths), (&quick.stages, &quick.network.widths));
+        assert_eq!(quick.with("network.widths=[4, 8]").unwrap().network.widths, [4, 8]);
+        assert_eq!(quick.with("learning_rate = 0.5").unwrap().learning_rate, 0.5);
+        for change in ["learning_rate", "learning_rate=fast", "learnin_rate=1.0", "network.k=0"] {
+            assert!(quick.with(change).is_err(), "{change}");
         }
     }
 

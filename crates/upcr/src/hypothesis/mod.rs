@@ -34,6 +34,8 @@ pub(crate) struct Problem<'a> {
     /// Distance between matched points under a right pose, at most.
     pub tolerance: f32,
     pub seed: u64,
+    /// Whether no other source will be asked.
+    pub alone: bool,
 }
 
 /// Something that proposes poses, best first.
@@ -45,6 +47,10 @@ pub(crate) trait HypothesisSource: Sync {
         0.75
     }
     fn propose(&self, problem: &Problem) -> Vec<Hypothesis>;
+    /// Other poses that might look as right as `best`, the best proposal once it lies closely; judged beside it.
+    fn alternatives(&self, _problem: &Problem, _best: &Rigid) -> Vec<Hypothesis> {
+        Vec::new()
+    }
 }
 
 /// Every source, cheapest first.
@@ -79,7 +85,7 @@ mod tests {
     use super::*;
     use crate::{
         CloudRole, PointCloud,
-        prepare::{check, prepare},
+        prepare::{Described, check, prepare},
     };
 
     /// 300 matches of which 90 follow one motion and the others none.
@@ -117,7 +123,7 @@ mod tests {
         let matches = planted(&truth);
         let corners = (0..8).map(|i| [i & 1, i >> 1 & 1, i >> 2].map(f64::from)).collect();
         let cloud = PointCloud::from_points(corners);
-        let ready = || prepare(&check(&cloud, CloudRole::Cloud).unwrap(), 0.5, true).unwrap();
+        let ready = || prepare(&check(&cloud, CloudRole::Cloud).unwrap(), 0.5, Described::Surely).unwrap();
         let (source, target) = (ready(), ready());
         for finder in SOURCES.iter().filter(|s| s.needs_matches()) {
             let problem = Problem {
@@ -128,6 +134,7 @@ mod tests {
                 network: None,
                 tolerance: 0.05,
                 seed: 1,
+                alone: true,
             };
             let best = finder.propose(&problem)[0];
             let off = separation(&best.pose, &truth, 1.0);
@@ -142,7 +149,7 @@ mod tests {
     fn no_matches_no_hypotheses() {
         let corners = (0..8).map(|i| [i & 1, i >> 1 & 1, i >> 2].map(f64::from)).collect();
         let cloud = PointCloud::from_points(corners);
-        let ready = prepare(&check(&cloud, CloudRole::Cloud).unwrap(), 0.5, true).unwrap();
+        let ready = prepare(&check(&cloud, CloudRole::Cloud).unwrap(), 0.5, Described::Surely).unwrap();
         for finder in SOURCES.iter().filter(|s| s.needs_matches()) {
             let problem = Problem {
                 source: &ready,
@@ -152,6 +159,7 @@ mod tests {
                 network: None,
                 tolerance: 0.05,
                 seed: 1,
+                alone: true,
             };
             assert!(finder.propose(&problem).is_empty(), "{:?}", finder.method());
         }

@@ -12,6 +12,12 @@ const PASSES: usize = 4;
 /// Points that tell how close the clouds are, and the share of the larger cloud's radius that counts as far.
 const JUDGED_POINTS: usize = 192;
 const FAR: f32 = 0.2;
+/// Score from which on the refinement needs no closer pose, and below which other sources are the better choice: right
+/// poses of overlapping shapes have 0.7 and more, wrong ones of scenes less.
+const CLOSE: f64 = 0.9;
+const HOPELESS: f64 = 0.7;
+/// Turns about a principal axis, in degrees, that lay nearly symmetric shapes on themselves.
+const TURNS_DEG: [f64; 5] = [90.0, 120.0, 180.0, 240.0, 270.0];
 
 pub(super) struct Upcr;
 
@@ -54,14 +60,16 @@ impl HypothesisSource for Upcr {
             let translation = pose.translation.map(|v| v as f32);
             points.iter().map(|&p| ((rotation * Vector3::from(p) + translation) * scale).into()).collect()
         };
-        let target_scaled = scaled(&target_points, &Rigid::identity());
+        let canonical_target = || network.canonical_pose(&scaled(&target_points, &Rigid::identity()));
+        let canonical_source = |pose: &Rigid| network.canonical_pose(&scaled(&source_points, pose));
         let closeness = |pose: &Rigid| overlap_at(source, target, pose, JUDGED_POINTS, FAR * radius).score(2);
 
-        let mut pose = problem.init;
-        let mut closest = 0.0;
+        let (mut pose, mut closest) = (problem.init, 0.0);
         let mut hypotheses: Vec<Hypothesis> = Vec::new();
-        for _ in 0..PASSES {
-            let Ok(step) = network.predict(&scaled(&source_points, &pose), &target_scaled) else { break };
+        let (mut found, canonical_target) = rayon::join(|| canonical_source(&pose), canonical_target);
+        let Ok(canonical_target) = canonical_target else { return Vec::new() };
+        while let Ok(canonical) = found {
+            let step = canonical_target * canonical.inverse();
             let next = Rigid { translation: step.translation * f64::from(radius), ..step } * pose;
             let closer = closeness(&next);
             if closer <= closest {
@@ -69,20 +77,29 @@ impl HypothesisSource for Upcr {
             }
             (pose, closest) = (next, closer);
             hypotheses.insert(0, Hypothesis { pose, method: Method::Upcr, support: 0 });
+            if closest >= CLOSE || hypotheses.len() == PASSES {
+                break;
+            }
+            found = canonical_source(&pose);
         }
-        if !hypotheses.is_empty() {
-            let turned = turns(&source_points).map(|turn| pose * turn);
-            hypotheses.extend(turned.map(|pose| Hypothesis { pose, method: Method::Upcr, support: 0 }));
+        if closest < HOPELESS && !problem.alone {
+            return Vec::new();
         }
         drop_repeats(&mut hypotheses, problem);
         hypotheses
     }
+
+    /// The network has one answer: whether a nearly symmetric shape has a better one, or another as good, only a
+    /// comparison tells.
+    fn alternatives(&self, problem: &Problem, best: &Rigid) -> Vec<Hypothesis> {
+        turns(&sample(&problem.source.fine))
+            .map(|turn| Hypothesis { pose: *best * turn, method: Method::Upcr, support: 0 })
+            .collect()
+    }
 }
 
-/// Turns of the points about their principal axes: the network has one answer, and whether a nearly symmetric shape
-/// has a better one, or another as good, only a comparison tells.
+/// Turns of the points about their principal axes.
 fn turns(points: &[[f32; 3]]) -> impl Iterator<Item = Rigid> {
-    const STEPS: u32 = 12;
     let weight = 1.0 / points.len().max(1) as f64;
     let mean = points.iter().map(|p| Vector3::from(p.map(f64::from)) * weight).sum::<Vector3<f64>>();
     let covariance: Matrix3<f64> = points
@@ -95,9 +112,8 @@ fn turns(points: &[[f32; 3]]) -> impl Iterator<Item = Rigid> {
     let axes = covariance.symmetric_eigen().eigenvectors;
     (0..3).flat_map(move |axis| {
         let axis = Unit::new_normalize(axes.column(axis).into_owned());
-        (1..STEPS).map(move |step| {
-            let angle = std::f64::consts::TAU * f64::from(step) / f64::from(STEPS);
-            let rotation = Rotation3::from_axis_angle(&axis, angle).into_inner();
+        TURNS_DEG.iter().map(move |angle| {
+            let rotation = Rotation3::from_axis_angle(&axis, angle.to_radians()).into_inner();
             Rigid { rotation, translation: mean - rotation * mean }
         })
     })

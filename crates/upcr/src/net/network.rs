@@ -154,6 +154,15 @@ impl Network {
         Ok(target? * source?.inverse())
     }
 
+    /// The pose of a cloud about the latent canonical shape, the two branches in parallel: that of a target times the
+    /// inverse of that of a source is what [`Self::predict`] gives.
+    ///
+    /// # Errors
+    /// Where the cloud is empty or holds a coordinate that is not finite.
+    pub fn canonical_pose(&self, cloud: &[[f32; 3]]) -> Result<Rigid> {
+        self.pose(cloud, CloudRole::Cloud)
+    }
+
     /// Every cloud's representations.
     ///
     /// # Errors
@@ -165,7 +174,6 @@ impl Network {
         })
     }
 
-    /// The pose of a cloud about the latent canonical shape.
     fn pose(&self, cloud: &[[f32; 3]], role: CloudRole) -> Result<Rigid> {
         self.rooms.with(|room| {
             self.run(cloud, role, room)?;
