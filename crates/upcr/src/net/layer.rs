@@ -32,12 +32,12 @@ impl Features {
 /// The products of one block of channels.
 #[derive(Debug, Default)]
 pub(super) struct Products {
-    center: Vec<Lanes>,
-    neighbor: Vec<Lanes>,
+    pub center: Vec<Lanes>,
+    pub neighbor: Vec<Lanes>,
 }
 
 impl Products {
-    fn reserve(&mut self, points: usize) {
+    pub fn reserve(&mut self, points: usize) {
         self.center.resize(whole_tiles(points), [0.0; BLOCK]);
         self.neighbor.resize(whole_tiles(points), [0.0; BLOCK]);
     }
@@ -46,7 +46,6 @@ impl Products {
 /// A layer over the graph, packed for inference.
 #[derive(Debug, Clone)]
 pub(super) struct GraphLayer {
-    outputs: usize,
     slope: f32,
     blocks: Vec<Block>,
 }
@@ -75,7 +74,7 @@ impl GraphLayer {
                 Block { center: center.collect(), shift: block.of(&map.shift), neighbor }
             })
             .collect();
-        Self { outputs: map.outputs, slope, blocks }
+        Self { slope, blocks }
     }
 
     /// The layer's features from those of the layer before it.
@@ -86,17 +85,6 @@ impl GraphLayer {
             let (out, stride) = (&mut output.values[b * BLOCK..], output.stride);
             kernel::gather(&products.center, &products.neighbor, graph, self.slope, out, stride);
         }
-    }
-
-    /// The maximum over all points of the layer's features.
-    pub fn pool(&self, input: &Features, graph: &Graph, products: &mut Products, gamma: &mut Vec<f32>) {
-        gamma.clear();
-        for block in &self.blocks {
-            block.multiply(input, graph.len(), products);
-            let all = kernel::gather_all(&products.center, &products.neighbor, graph, self.slope);
-            gamma.extend(all);
-        }
-        gamma.truncate(self.outputs);
     }
 }
 
@@ -167,15 +155,15 @@ impl Embedding {
 }
 
 /// A block of a layer's channels.
-struct Channels(usize);
+pub(super) struct Channels(usize);
 
-fn blocks(channels: usize) -> impl Iterator<Item = Channels> {
+pub(super) fn blocks(channels: usize) -> impl Iterator<Item = Channels> {
     (0..channels).step_by(BLOCK).map(Channels)
 }
 
 impl Channels {
     /// The block's part of one value a channel, zero beyond the last.
-    fn of(&self, values: &[f32]) -> Lanes {
+    pub fn of(&self, values: &[f32]) -> Lanes {
         std::array::from_fn(|l| values.get(self.0 + l).copied().unwrap_or(0.0))
     }
 }

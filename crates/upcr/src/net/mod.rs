@@ -7,7 +7,10 @@ mod invariant;
 mod kernel;
 mod layer;
 mod network;
+mod pool;
 mod search;
+#[cfg(target_arch = "x86_64")]
+mod simd;
 mod weights;
 
 pub use config::{GraphKind, NetworkConfig, RotationKind};
