@@ -20,10 +20,18 @@ pub(super) type Quad = [u8; 4];
 pub(super) type QuadLanes = [[i8; 4]; 2 * BLOCK];
 /// Inner products of quads.
 pub(super) type Sums = [i32; 2 * BLOCK];
+/// Upper bounds of a block's products or values.
+pub(super) type Bounds = [i16; BLOCK];
+
+/// A point, and a bit for each channel of a block.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Hit {
+    pub point: u32,
+    pub channels: u32,
+}
+
 /// Whether every processor that this is built for multiplies and adds in one step.
 const FUSED: bool = cfg!(any(target_feature = "fma", target_arch = "aarch64"));
-/// Largest weight of a quad: two products with a byte fit into 16 bits.
-pub(super) const MOST: f64 = 64.0;
 
 /// The number of rows that hold `points` in whole tiles.
 pub(super) fn whole_tiles(points: usize) -> usize {
@@ -110,10 +118,10 @@ fn dot_portable(a: &[f32], b: &[f32]) -> f32 {
 }
 
 /// `out[i] = Σₖ rows[i·stride + k] · panel[k]`, for whole tiles of rows, exactly: quads are inner products of four
-/// bytes. Those of the panel lie within ±[`MOST`].
+/// bytes. Those of the panel lie within ±[`highest_weight`].
 pub(super) fn multiply_quads(rows: &[Quad], stride: usize, panel: &[QuadLanes], out: &mut [Sums]) {
     #[cfg(target_arch = "x86_64")]
-    if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512f") {
+    if has_quads() {
         // SAFETY: the processor has what it needs.
         return unsafe { simd::multiply_quads_avx512(rows, stride, panel, out) };
     } else if is_x86_feature_detected!("avx2") {
@@ -121,6 +129,21 @@ pub(super) fn multiply_quads(rows: &[Quad], stride: usize, panel: &[QuadLanes], 
         return unsafe { simd::multiply_quads_avx2(rows, stride, panel, out) };
     }
     multiply_quads_portable(rows, stride, panel, out);
+}
+
+/// The largest weight of a quad that this processor multiplies exactly.
+pub(super) fn highest_weight() -> f64 {
+    #[cfg(target_arch = "x86_64")]
+    if !has_quads() && is_x86_feature_detected!("avx2") {
+        // Two products with a byte have to fit into 16 bits.
+        return 64.0;
+    }
+    127.0
+}
+
+#[cfg(target_arch = "x86_64")]
+fn has_quads() -> bool {
+    is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512f")
 }
 
 fn multiply_quads_portable(rows: &[Quad], stride: usize, panel: &[QuadLanes], out: &mut [Sums]) {
@@ -148,17 +171,19 @@ pub(super) fn gather(
     out: &mut [f32],
     stride: usize,
 ) {
-    for ((row, center), out) in graph.rows().zip(center).zip(out.chunks_mut(stride)) {
-        let most = largest(neighbor, row);
+    let out = out.chunks_mut(stride).filter_map(<[f32]>::first_chunk_mut::<BLOCK>);
+    for ((row, center), out) in graph.rows().zip(center).zip(out) {
+        let mut values = largest(neighbor, row);
         for l in 0..BLOCK {
-            out[l] = leaky(center[l] + most[l], slope);
+            values[l] = leaky(center[l] + values[l], slope);
         }
+        *out = values;
     }
 }
 
 /// The channels' largest values over the points in `row`.
 #[inline(always)]
-pub(super) fn largest(values: &[Lanes], row: &[u32]) -> Lanes {
+fn largest(values: &[Lanes], row: &[u32]) -> Lanes {
     let mut most = [f32::NEG_INFINITY; BLOCK];
     for &j in row {
         let values = &values[j as usize];
@@ -208,7 +233,8 @@ fn embed_by<const FUSED: bool>(
     stride: usize,
 ) {
     let dim = weights.len();
-    for (i, (row, out)) in graph.rows().zip(out.chunks_mut(stride)).enumerate() {
+    let out = out.chunks_mut(stride).filter_map(<[f32]>::first_chunk_mut::<BLOCK>);
+    for (i, (row, out)) in graph.rows().zip(out).enumerate() {
         let mut most = [f32::NEG_INFINITY; BLOCK];
         for (slot, &j) in row.iter().enumerate() {
             let mut sums = neighbor[j as usize];
@@ -222,8 +248,30 @@ fn embed_by<const FUSED: bool>(
                 most[l] = larger(most[l], sums[l]);
             }
         }
-        for l in 0..BLOCK {
-            out[l] = leaky(most[l], slope);
+        *out = most.map(|v| leaky(v, slope));
+    }
+}
+
+/// Finds the points and channels whose bounds exceed `bar`.
+pub(super) fn above(bounds: &[Bounds], bar: &Bounds, hits: &mut Vec<Hit>) {
+    hits.clear();
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512bw") {
+        // SAFETY: the processor has what it needs.
+        return unsafe { simd::above_avx512(bounds, bar, hits) };
+    } else if is_x86_feature_detected!("avx2") {
+        // SAFETY: as above.
+        return unsafe { simd::above_avx2(bounds, bar, hits) };
+    }
+    above_portable(bounds, bar, hits);
+}
+
+fn above_portable(bounds: &[Bounds], bar: &Bounds, hits: &mut Vec<Hit>) {
+    for (point, bounds) in (0..).zip(bounds) {
+        let above = (0..BLOCK).filter(|&l| bounds[l] > bar[l]);
+        let channels = above.fold(0, |channels, l| channels | 1 << l);
+        if channels != 0 {
+            hits.push(Hit { point, channels });
         }
     }
 }
@@ -290,7 +338,7 @@ mod tests {
     #[test]
     fn products_of_bytes_are_the_same_in_every_instruction_set() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let most = MOST as i8;
+        let most = 64;
         for round in 0..50 {
             let stride = rng.random_range(1..40);
             // The last rounds are of extreme values alone.
@@ -303,7 +351,7 @@ mod tests {
             let mut expected = vec![[0; 2 * BLOCK]; POINTS];
             multiply_quads_portable(&rows, stride, &panel, &mut expected);
             let mut found = vec![[0; 2 * BLOCK]; POINTS];
-            if is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512f") {
+            if has_quads() {
                 // SAFETY: the processor has what it needs.
                 unsafe { simd::multiply_quads_avx512(&rows, stride, &panel, &mut found) };
                 assert_eq!(found, expected);
@@ -312,6 +360,28 @@ mod tests {
                 found.fill([0; 2 * BLOCK]);
                 // SAFETY: as above.
                 unsafe { simd::multiply_quads_avx2(&rows, stride, &panel, &mut found) };
+                assert_eq!(found, expected);
+            }
+        }
+    }
+
+    #[test]
+    fn points_above_a_bar_are_the_same_in_every_instruction_set() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let mut bounds = || -> Bounds { std::array::from_fn(|_| rng.random_range(-3..3) * 10_000) };
+        for _ in 0..50 {
+            let (rows, bar): (Vec<_>, _) = ((0..20).map(|_| bounds()).collect(), bounds());
+            let [mut expected, mut found] = [vec![], vec![]];
+            above_portable(&rows, &bar, &mut expected);
+            if is_x86_feature_detected!("avx512bw") {
+                // SAFETY: the processor has what it needs.
+                unsafe { simd::above_avx512(&rows, &bar, &mut found) };
+                assert_eq!(found, expected);
+            }
+            if is_x86_feature_detected!("avx2") {
+                found.clear();
+                // SAFETY: as above.
+                unsafe { simd::above_avx2(&rows, &bar, &mut found) };
                 assert_eq!(found, expected);
             }
         }

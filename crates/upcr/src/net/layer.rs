@@ -32,12 +32,12 @@ impl Features {
 /// The products of one block of channels.
 #[derive(Debug, Default)]
 pub(super) struct Products {
-    pub center: Vec<Lanes>,
-    pub neighbor: Vec<Lanes>,
+    center: Vec<Lanes>,
+    neighbor: Vec<Lanes>,
 }
 
 impl Products {
-    pub fn reserve(&mut self, points: usize) {
+    fn reserve(&mut self, points: usize) {
         self.center.resize(whole_tiles(points), [0.0; BLOCK]);
         self.neighbor.resize(whole_tiles(points), [0.0; BLOCK]);
     }

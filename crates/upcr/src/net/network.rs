@@ -254,7 +254,7 @@ impl Network {
             channels = outputs;
         }
         let graph = self.neighbors(features, channels, graph, order, own, search);
-        branch.last.apply(features, graph, products, pool, gamma);
+        branch.last.apply(features, graph, pool, gamma);
     }
 
     /// The graph of a layer: `graph`, or `own`, filled with that of the layer's features.

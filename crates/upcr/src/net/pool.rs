@@ -2,26 +2,32 @@
 //! maximum.
 //!
 //! Every value is bounded from above first, by products in bytes at a fraction of the cost. With a point's features as
-//! F = μ + s·q + r and a channel's weights as w = t·v + u, where q and v are bytes,
+//! F = μ + s·q + r about a mean and a channel's weights as w = t·v + u, where q and v are bytes,
 //! `w·F = w·μ + s·t·q·v + s·q·u + w·r ≤ w·μ + s·t·q·v + ‖s·q‖‖u‖ + ‖w‖‖r‖`. A value whose bound does not exceed one that
-//! is known cannot be larger: the result is that of computing all.
+//! is known cannot be larger: the result is that of computing all. Bounds are whole numbers of a unit.
 
 use multiversion::multiversion;
 
 use super::Graph;
 use super::kernel::{
-    self, BLOCK, Lanes, MOST, Quad, QuadLanes, Sums, dot, larger, largest, leaky, whole_tiles,
+    self, BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, dot, larger, leaky, whole_tiles,
 };
-use super::layer::{Features, Products, blocks};
+use super::layer::{Features, blocks};
 use super::weights::Affine;
 
+/// Points that share a mean: where near points are near each other, their features differ less than those of all.
+const GROUP: usize = 128;
+/// Largest byte of a centred feature, which is stored with `ZERO` added.
+const HIGHEST: f32 = 127.0;
+const ZERO: i32 = 128;
+/// Largest bound of a product: two of them add up within 16 bits.
+const TOP: i16 = 16_383;
+/// Added to a number, it leaves the nearest integer in the last bits.
+const ROUND: f32 = 12_582_912.0;
 /// Beyond products of this size nothing is bounded: sums of them might overflow.
 const BOUNDED: f32 = 1e30;
 /// What squares that underflow may hide from a length, for each root of their number.
 const UNDERFLOW: f32 = 1.1e-19;
-/// Largest byte of a centred feature, which is stored with `ZERO` added.
-const HIGHEST: f32 = 127.0;
-const ZERO: i32 = 128;
 
 /// The last layer, packed for inference.
 #[derive(Debug, Clone)]
@@ -35,7 +41,7 @@ pub(super) struct PooledLayer {
 /// One block of channels.
 #[derive(Debug, Clone)]
 struct Block {
-    /// Of the center's map, then the neighbour's.
+    /// The center's weights in bytes, then the neighbour's.
     panel: Vec<QuadLanes>,
     center: Map,
     neighbor: Map,
@@ -58,21 +64,46 @@ struct Map {
 /// What pooling needs room for.
 #[derive(Debug, Default)]
 pub(super) struct PoolRoom {
+    features: Quantized,
+    sums: Vec<Sums>,
+    /// Bounds of products, and of values.
+    center: Vec<Bounds>,
+    neighbor: Vec<Bounds>,
+    upper: Vec<Bounds>,
+    hits: Vec<Hit>,
+    /// The neighbour's products, where a point's bits say that they are known.
+    products: Vec<Lanes>,
+    known: Vec<u32>,
+}
+
+/// Features as bytes about the means of their groups.
+#[derive(Debug, Default)]
+struct Quantized {
     quads: Vec<Quad>,
     rows: Vec<Row>,
-    mean: Vec<f32>,
+    /// A row a group.
+    means: Vec<f32>,
+    /// Scratch: a row's distance from its mean, then r.
     rest: Vec<f32>,
-    sums: Vec<Sums>,
-    upper: Vec<Lanes>,
 }
 
 /// s, ‖s·q‖ and ‖r‖ of a point, the lengths rounded up.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 struct Row {
     unit: f32,
     length: f32,
     lost: f32,
 }
+
+/// Bounds of the lengths of features and means, and of what sets these apart.
+#[derive(Debug, Clone, Copy)]
+struct Reach {
+    features: f32,
+    rest: f32,
+}
+
+/// Of features that are too long to be bounded.
+const UNBOUNDED: Reach = Reach { features: f32::INFINITY, rest: f32::INFINITY };
 
 impl PooledLayer {
     /// From the map over `[Fᵢ ; Fⱼ − Fᵢ]`.
@@ -81,13 +112,11 @@ impl PooledLayer {
         let blocks = blocks(map.outputs)
             .map(|block| {
                 let w2: Vec<Lanes> = (0..inputs).map(|k| block.of(map.row(inputs + k))).collect();
-                let center: Vec<Lanes> = (0..inputs)
-                    .zip(&w2)
-                    .map(|(k, w2)| {
-                        let w1 = block.of(map.row(k));
-                        std::array::from_fn(|l| w1[l] - w2[l])
-                    })
-                    .collect();
+                let center = (0..inputs).zip(&w2).map(|(k, w2)| {
+                    let w1 = block.of(map.row(k));
+                    std::array::from_fn(|l| w1[l] - w2[l])
+                });
+                let center: Vec<Lanes> = center.collect();
                 let mut panel = vec![[[0; 4]; 2 * BLOCK]; inputs.div_ceil(4)];
                 let center = Map::new(&center, block.of(&map.shift), &mut panel, 0);
                 let neighbor = Map::new(&w2, [0.0; BLOCK], &mut panel, BLOCK);
@@ -98,45 +127,133 @@ impl PooledLayer {
     }
 
     /// The maximum over all points of the layer's features.
-    pub fn apply(
-        &self,
-        input: &Features,
-        graph: &Graph,
-        products: &mut Products,
-        room: &mut PoolRoom,
-        gamma: &mut Vec<f32>,
-    ) {
-        let reach = quantize(input, self.inputs, graph.len(), room);
-        self.apply_within(reach, input, graph, products, room, gamma);
+    pub fn apply(&self, input: &Features, graph: &Graph, room: &mut PoolRoom, gamma: &mut Vec<f32>) {
+        let reach = quantize(input, self.inputs, graph.len(), &mut room.features);
+        self.apply_within(reach, input, graph, room, gamma);
     }
 
-    /// Features and their mean are no longer than half of `reach`; where that is infinite, every value is computed.
+    /// [`Self::apply`] to quantized features; where they are [`UNBOUNDED`], every value is computed.
     fn apply_within(
         &self,
-        reach: f32,
+        reach: Reach,
         input: &Features,
         graph: &Graph,
-        products: &mut Products,
         room: &mut PoolRoom,
         gamma: &mut Vec<f32>,
     ) {
-        products.reserve(graph.len());
-        room.sums.resize(whole_tiles(graph.len()), [0; 2 * BLOCK]);
-        room.upper.resize(graph.len(), [0.0; BLOCK]);
+        let points = graph.len();
+        room.sums.resize(whole_tiles(points), [0; 2 * BLOCK]);
+        room.center.resize(points, [0; BLOCK]);
+        room.neighbor.resize(points, [0; BLOCK]);
+        room.upper.resize(points, [0; BLOCK]);
+        room.products.resize(points, [0.0; BLOCK]);
         gamma.clear();
         for block in &self.blocks {
-            block.bound(reach, products, room);
-            let most = gather_bounds(products, graph, &mut room.upper);
-            let values = search(block, input, graph, &mut products.neighbor, &room.upper, &most);
+            let units = block.bound(reach, room);
+            let most = gather(&room.center, &room.neighbor, graph, &mut room.upper);
+            let values = block.search(&units, &most, input, graph, room);
             gamma.extend(values.map(|v| leaky(v, self.slope)));
         }
         gamma.truncate(self.outputs);
     }
 }
 
+impl Block {
+    /// Bounds the products; returns the bounds' units.
+    fn bound(&self, reach: Reach, room: &mut PoolRoom) -> Lanes {
+        let PoolRoom { features, sums, center, neighbor, .. } = room;
+        let longest = self.center.length.iter().chain(&self.neighbor.length).copied().fold(0.0, f32::max);
+        if longest * (reach.features + reach.rest) < BOUNDED {
+            kernel::multiply_quads(&features.quads, self.panel.len(), &self.panel, sums);
+            let tops = [self.center.tops(reach), self.neighbor.tops(reach)];
+            let units = std::array::from_fn(|l| tops[0][l].max(tops[1][l]) / f32::from(TOP));
+            bound::<0>(&self.center, reach, &units, features, sums, center);
+            bound::<1>(&self.neighbor, reach, &units, features, sums, neighbor);
+            units
+        } else {
+            center.fill([TOP; BLOCK]);
+            neighbor.fill([TOP; BLOCK]);
+            [f32::INFINITY; BLOCK]
+        }
+    }
+
+    /// The largest value of each channel before the rectifier, of which `room.upper` holds bounds, `most` the highest.
+    fn search(
+        &self,
+        units: &Lanes,
+        most: &Bounds,
+        input: &Features,
+        graph: &Graph,
+        room: &mut PoolRoom,
+    ) -> Lanes {
+        let PoolRoom { center: centers, neighbor, upper, hits, products, known, .. } = room;
+        let features = |i: usize| &input.values[i * input.stride..][..self.center.inputs()];
+        known.clear();
+        known.resize(graph.len(), 0);
+        let mut best = [f32::NEG_INFINITY; BLOCK];
+        let mut bars = [i16::MIN; BLOCK];
+        // The points of the highest bounds first, then those of high ones: they leave few others.
+        for stage in [Stage::Highest, Stage::High, Stage::All] {
+            kernel::above(upper, &std::array::from_fn(|l| stage.bar(bars[l], most[l])), hits);
+            for &Hit { point, mut channels } in hits.iter() {
+                let i = point as usize;
+                while channels != 0 {
+                    let l = channels.trailing_zeros() as usize;
+                    channels &= channels - 1;
+                    if upper[i][l] <= bars[l] {
+                        continue;
+                    }
+                    let center = dot(self.center.row(l), features(i)) + self.center.shift[l];
+                    let with = |neighbor: i16| center + f32::from(neighbor) * units[l];
+                    if with(upper[i][l] - centers[i][l]) <= best[l] {
+                        continue;
+                    }
+                    for &j in graph.row(i) {
+                        let j = j as usize;
+                        if with(neighbor[j][l]) > best[l] {
+                            if known[j] & 1 << l == 0 {
+                                known[j] |= 1 << l;
+                                products[j][l] = dot(self.neighbor.row(l), features(j));
+                            }
+                            best[l] = larger(center + products[j][l], best[l]);
+                        }
+                    }
+                    bars[l] = bar(best[l], units[l]);
+                }
+            }
+        }
+        best
+    }
+}
+
+/// Which of the points that may be the maximum are looked at.
+#[derive(Clone, Copy)]
+enum Stage {
+    Highest,
+    High,
+    All,
+}
+
+impl Stage {
+    /// What bounds have to exceed, between what the best value asks for and the highest of them.
+    fn bar(self, least: i16, most: i16) -> i16 {
+        match self {
+            Self::Highest => most - 1,
+            Self::High => least.midpoint(most),
+            Self::All => least,
+        }
+    }
+}
+
+/// Values whose bounds do not exceed it are not larger than `best`.
+fn bar(best: f32, unit: f32) -> i16 {
+    ((best / unit).floor() - 1.0) as i16
+}
+
 impl Map {
     /// From a row an input; writes the weights in bytes to the panel's channels from `at`.
     fn new(rows: &[Lanes], shift: Lanes, panel: &mut [QuadLanes], at: usize) -> Self {
+        let highest = kernel::highest_weight();
         let mut map = Self {
             weights: Vec::with_capacity(BLOCK * rows.len()),
             shift,
@@ -148,10 +265,11 @@ impl Map {
         for l in 0..BLOCK {
             let weights = rows.iter().map(|row| row[l]);
             let most = weights.clone().map(f32::abs).fold(0.0, f32::max);
-            let unit = (f64::from(most) / MOST) as f32;
+            let unit = (f64::from(most) / highest) as f32;
             let (mut length_sq, mut lost_sq) = (0.0, 0.0);
             for (k, w) in weights.clone().map(f64::from).enumerate() {
-                let byte = if unit > 0.0 { (w / f64::from(unit)).round().clamp(-MOST, MOST) } else { 0.0 };
+                let byte =
+                    if unit > 0.0 { (w / f64::from(unit)).round().clamp(-highest, highest) } else { 0.0 };
                 length_sq += w * w;
                 lost_sq += (w - byte * f64::from(unit)).powi(2);
                 panel[k / 4][at + l][k % 4] = byte as i8;
@@ -165,9 +283,30 @@ impl Map {
         map
     }
 
+    fn inputs(&self) -> usize {
+        self.weights.len() / BLOCK
+    }
+
     fn row(&self, channel: usize) -> &[f32] {
-        let inputs = self.weights.len() / BLOCK;
-        &self.weights[channel * inputs..][..inputs]
+        &self.weights[channel * self.inputs()..][..self.inputs()]
+    }
+
+    /// What rounding may change: in two inner products, and in some sixty steps of the bounds and the lengths.
+    fn slack(&self, reach: Reach) -> Lanes {
+        let steps = (self.inputs() + 64) as f32;
+        std::array::from_fn(|l| {
+            let size = 2.0 * self.length[l] * reach.features + self.shift[l].abs();
+            steps * f32::EPSILON * size + f32::MIN_POSITIVE
+        })
+    }
+
+    /// What no bound exceeds, with one in a thousand to spare.
+    fn tops(&self, reach: Reach) -> Lanes {
+        let slack = self.slack(reach);
+        std::array::from_fn(|l| {
+            let product = self.length[l] * (reach.features + reach.rest) + 2.0 * self.lost[l] * reach.rest;
+            (1.001 * (product + self.shift[l].abs() + slack[l])).max(1e-30)
+        })
     }
 }
 
@@ -176,148 +315,110 @@ fn rounded_up(value: f64) -> f32 {
     (value * (1.0 + 1e-6)) as f32 + f32::MIN_POSITIVE
 }
 
-impl Block {
-    /// Puts upper bounds of the block's products in the place of the products.
-    fn bound(&self, reach: f32, products: &mut Products, room: &mut PoolRoom) {
-        let (center, neighbor) = (&mut products.center, &mut products.neighbor);
-        let longest = self.center.length.iter().chain(&self.neighbor.length).copied().fold(0.0, f32::max);
-        if longest * reach < BOUNDED {
-            kernel::multiply_quads(&room.quads, self.panel.len(), &self.panel, &mut room.sums);
-            bound::<0>(&self.center, reach, room, center);
-            bound::<1>(&self.neighbor, reach, room, neighbor);
-        } else {
-            center.fill([f32::INFINITY; BLOCK]);
-            neighbor.fill([f32::INFINITY; BLOCK]);
-        }
-    }
-}
-
-/// Upper bounds of a map's products from those in bytes, of which the map's are half number `HALF`.
-#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+fma", "x86_64+avx2+fma"))]
-fn bound<const HALF: usize>(map: &Map, reach: f32, room: &PoolRoom, bounds: &mut [Lanes]) {
-    // Rounding: two inner products', and some sixty steps' here and in the lengths.
-    let steps = (room.mean.len() + 64) as f32;
-    let base: Lanes = std::array::from_fn(|l| {
-        let slack = steps * f32::EPSILON * (2.0 * map.length[l] * reach + map.shift[l].abs());
-        dot(map.row(l), &room.mean) + map.shift[l] + (slack + f32::MIN_POSITIVE)
-    });
-    for ((row, sums), bounds) in room.rows.iter().zip(&room.sums).zip(bounds) {
-        for l in 0..BLOCK {
-            let product = (sums[HALF * BLOCK + l] - map.offset[l]) as f32 * row.unit * map.unit[l];
-            bounds[l] = base[l] + product + (row.lost * map.length[l] + row.length * map.lost[l]);
-        }
-    }
-}
-
-/// Writes features as bytes about their mean. Returns a bound of the sum of any two lengths among the features and
-/// their mean, infinite where they are too long to be bounded.
+/// Bounds of a map's products, in `units`, from those in bytes, of which the map's are half number `HALF`.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+avx512bw+fma", "x86_64+avx2+fma"))]
-fn quantize(input: &Features, inputs: usize, points: usize, room: &mut PoolRoom) -> f32 {
-    /// Added to a number, it leaves the nearest integer in the last bits.
-    const ROUND: f32 = 12_582_912.0;
-    let PoolRoom { quads, rows, mean, rest, .. } = room;
-    let features = || input.values.chunks_exact(input.stride).take(points);
-    mean.clear();
-    mean.resize(inputs, 0.0);
-    for row in features() {
-        for (mean, v) in mean.iter_mut().zip(row) {
-            *mean += v;
+fn bound<const HALF: usize>(
+    map: &Map,
+    reach: Reach,
+    units: &Lanes,
+    features: &Quantized,
+    sums: &[Sums],
+    bounds: &mut [Bounds],
+) {
+    let slack = map.slack(reach);
+    let scale = units.map(|unit| 1.0 / unit);
+    let groups = features.rows.chunks(GROUP).zip(features.means.chunks_exact(map.inputs()));
+    for (((rows, mean), sums), bounds) in groups.zip(sums.chunks(GROUP)).zip(bounds.chunks_mut(GROUP)) {
+        let base: Lanes = std::array::from_fn(|l| dot(map.row(l), mean) + map.shift[l] + slack[l]);
+        for ((row, sums), bounds) in rows.iter().zip(sums).zip(bounds) {
+            let mut rounded = [0; BLOCK];
+            for l in 0..BLOCK {
+                let product = (sums[HALF * BLOCK + l] - map.offset[l]) as f32 * row.unit * map.unit[l];
+                let bound = base[l] + product + (row.lost * map.length[l] + row.length * map.lost[l]);
+                // At least half a unit is left for what is rounded from here on.
+                rounded[l] = (bound * scale[l] + ROUND).to_bits() as i16 + 1;
+            }
+            *bounds = rounded;
         }
     }
-    for mean in mean.iter_mut() {
-        *mean /= points as f32;
-    }
+}
+
+/// Writes features as bytes.
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512dq+avx512bw+fma", "x86_64+avx2+fma"))]
+fn quantize(input: &Features, inputs: usize, points: usize, quantized: &mut Quantized) -> Reach {
+    let Quantized { quads, rows, means, rest } = quantized;
     let floor = UNDERFLOW * (inputs as f32).sqrt();
     let rounding = 1.0 + inputs as f32 * f32::EPSILON;
     let length = |v: &[f32]| dot(v, v).sqrt() * rounding + floor;
-    let mut longest = length(mean);
-    let stride = inputs.div_ceil(4);
-    quads.clear();
-    quads.resize(whole_tiles(points) * stride, [0; 4]);
+    let quads_a_row = inputs.div_ceil(4);
+    // What a row has beyond its inputs meets no weight.
+    quads.resize(whole_tiles(points) * quads_a_row, [0; 4]);
     rows.clear();
     rest.resize(inputs, 0.0);
-    for (row, quads) in features().zip(quads.chunks_exact_mut(stride)) {
-        let row = &row[..inputs];
-        // Where a feature is no number, the mean is none, and stays.
-        longest = larger(length(row), longest);
-        if !longest.is_finite() {
-            return f32::INFINITY;
+    means.clear();
+    means.resize(points.div_ceil(GROUP) * inputs, 0.0);
+    let mut reach = Reach { features: 0.0, rest: 0.0 };
+    let features = input.values[..points * input.stride].chunks(GROUP * input.stride);
+    let groups = features.zip(quads.chunks_mut(GROUP * quads_a_row)).zip(means.chunks_exact_mut(inputs));
+    for ((features, quads), mean) in groups {
+        let features = || features.chunks_exact(input.stride).map(|row| &row[..inputs]);
+        for row in features() {
+            for (mean, v) in mean.iter_mut().zip(row) {
+                *mean += v;
+            }
         }
-        for ((rest, v), mean) in rest.iter_mut().zip(row).zip(mean.iter()) {
-            *rest = v - mean;
+        let share = 1.0 / features().len() as f32;
+        for mean in mean.iter_mut() {
+            *mean *= share;
         }
-        // Non-negative floats order as their bits do.
-        let most = f32::from_bits(rest.iter().map(|v| v.abs().to_bits()).fold(0, u32::max));
-        let (unit, steps) = if most > 1e-30 { (most / HIGHEST, HIGHEST / most) } else { (0.0, 0.0) };
-        let mut length_sq = 0;
-        for (byte, rest) in quads.as_flattened_mut().iter_mut().zip(rest.iter_mut()) {
-            let rounded = *rest * steps + ROUND;
-            let whole = rounded.to_bits() as i32 - ROUND.to_bits() as i32;
-            *byte = (whole + ZERO) as u8;
-            *rest -= (rounded - ROUND) * unit;
-            length_sq += whole * whole;
+        // Where a feature is no number, the mean is none either.
+        reach.features = larger(reach.features, length(mean));
+        for (row, quads) in features().zip(quads.chunks_exact_mut(quads_a_row)) {
+            reach.features = larger(length(row), reach.features);
+            if !reach.features.is_finite() {
+                return UNBOUNDED;
+            }
+            for ((rest, v), mean) in rest.iter_mut().zip(row).zip(mean.iter()) {
+                *rest = v - mean;
+            }
+            // Non-negative floats order as their bits do.
+            let most = f32::from_bits(rest.iter().map(|v| v.abs().to_bits()).fold(0, u32::max));
+            let (unit, steps) = if most > 1e-30 { (most / HIGHEST, HIGHEST / most) } else { (0.0, 0.0) };
+            let mut length_sq = 0;
+            for (byte, rest) in quads.as_flattened_mut().iter_mut().zip(rest.iter_mut()) {
+                let rounded = *rest * steps + ROUND;
+                let whole = rounded.to_bits() as i32 - ROUND.to_bits() as i32;
+                *byte = (whole + ZERO) as u8;
+                *rest -= (rounded - ROUND) * unit;
+                length_sq += whole * whole;
+            }
+            let row = Row { unit, length: (length_sq as f32).sqrt() * unit * rounding, lost: length(rest) };
+            reach.rest = larger(row.length + row.lost, reach.rest);
+            rows.push(row);
         }
-        let length_of_bytes = (length_sq as f32).sqrt() * unit * rounding;
-        rows.push(Row { unit, length: length_of_bytes, lost: length(rest) });
     }
-    2.0 * longest
+    reach
 }
 
 /// Bounds of the values at every point, and the highest of each channel.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-fn gather_bounds(products: &Products, graph: &Graph, upper: &mut [Lanes]) -> Lanes {
-    let mut most = [f32::NEG_INFINITY; BLOCK];
-    for ((row, center), upper) in graph.rows().zip(&products.center).zip(upper) {
-        let of_neighbors = largest(&products.neighbor, row);
+#[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw", "x86_64+avx2"))]
+fn gather(center: &[Bounds], neighbor: &[Bounds], graph: &Graph, upper: &mut [Bounds]) -> Bounds {
+    let mut highest = [i16::MIN; BLOCK];
+    for ((row, center), upper) in graph.rows().zip(center).zip(upper) {
+        let mut most = [i16::MIN; BLOCK];
+        for &j in row {
+            let bounds = &neighbor[j as usize];
+            for l in 0..BLOCK {
+                most[l] = most[l].max(bounds[l]);
+            }
+        }
         for l in 0..BLOCK {
-            upper[l] = center[l] + of_neighbors[l];
-            most[l] = larger(upper[l], most[l]);
+            most[l] += center[l];
+            highest[l] = highest[l].max(most[l]);
         }
+        *upper = most;
     }
-    most
-}
-
-/// The largest value of each channel before the rectifier. Bounds of `neighbor` are replaced by what they bound.
-#[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
-fn search(
-    block: &Block,
-    input: &Features,
-    graph: &Graph,
-    neighbor: &mut [Lanes],
-    upper: &[Lanes],
-    most: &Lanes,
-) -> Lanes {
-    let inputs = block.center.weights.len() / BLOCK;
-    let features = |i: usize| &input.values[i * input.stride..][..inputs];
-    let mut best = [f32::NEG_INFINITY; BLOCK];
-    // The points of the highest bounds first: they leave few others.
-    for least in [most.map(f32::next_down), best] {
-        let mut bar: Lanes = std::array::from_fn(|l| larger(least[l], best[l]));
-        for (i, upper) in upper.iter().enumerate() {
-            let mut any = false;
-            for l in 0..BLOCK {
-                any |= upper[l] > bar[l];
-            }
-            if !any {
-                continue;
-            }
-            for l in 0..BLOCK {
-                if upper[l] <= bar[l] {
-                    continue;
-                }
-                let center = dot(block.center.row(l), features(i)) + block.center.shift[l];
-                for &j in graph.row(i) {
-                    let bound = &mut neighbor[j as usize][l];
-                    if center + *bound > best[l] {
-                        *bound = dot(block.neighbor.row(l), features(j as usize));
-                        best[l] = larger(center + *bound, best[l]);
-                    }
-                }
-                bar[l] = larger(best[l], bar[l]);
-            }
-        }
-    }
-    best
+    highest
 }
 
 #[cfg(test)]
@@ -359,19 +460,19 @@ mod tests {
             Self { layer: PooledLayer::new(&map, 0.2), features, graph }
         }
 
-        fn apply(&self, reach: Option<f32>) -> Vec<f32> {
-            let (mut products, mut room, mut gamma) = <(Products, PoolRoom, Vec<f32>)>::default();
+        fn apply(&self, reach: Option<Reach>) -> Vec<f32> {
+            let (mut room, mut gamma) = <(PoolRoom, Vec<f32>)>::default();
             let Self { layer, features, graph } = self;
-            let found = quantize(features, layer.inputs, graph.len(), &mut room);
+            let found = quantize(features, layer.inputs, graph.len(), &mut room.features);
             let reach = reach.unwrap_or(found);
-            layer.apply_within(reach, features, graph, &mut products, &mut room, &mut gamma);
+            layer.apply_within(reach, features, graph, &mut room, &mut gamma);
             gamma
         }
 
         /// The same bits as where nothing is left out.
         fn assert_exact(&self) {
             let bits = |values: Vec<f32>| values.into_iter().map(f32::to_bits).collect::<Vec<_>>();
-            assert_eq!(bits(self.apply(None)), bits(self.apply(Some(f32::INFINITY))));
+            assert_eq!(bits(self.apply(None)), bits(self.apply(Some(UNBOUNDED))));
         }
     }
 

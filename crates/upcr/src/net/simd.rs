@@ -4,7 +4,7 @@
 #[allow(clippy::wildcard_imports)]
 use std::arch::x86_64::*;
 
-use super::kernel::{BLOCK, Lanes, Quad, QuadLanes, Sums, TILE};
+use super::kernel::{BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE};
 
 /// [`multiply`](super::kernel::multiply) in vectors of 16.
 #[target_feature(enable = "avx512f")]
@@ -182,6 +182,41 @@ pub(super) fn multiply_quads_avx2(rows: &[Quad], stride: usize, panel: &[QuadLan
                     unsafe { _mm256_storeu_si256(out.as_mut_ptr().cast(), sum) };
                 }
             }
+        }
+    }
+}
+
+/// [`above`](super::kernel::above) in vectors of 32.
+#[target_feature(enable = "avx512f,avx512bw")]
+pub(super) fn above_avx512(bounds: &[Bounds], bar: &Bounds, hits: &mut Vec<Hit>) {
+    // SAFETY: reads the 32 values of a block.
+    let load = |bounds: &Bounds| unsafe { _mm512_loadu_epi16(bounds.as_ptr()) };
+    let bar = load(bar);
+    for (point, bounds) in (0..).zip(bounds) {
+        let channels = _mm512_cmpgt_epi16_mask(load(bounds), bar);
+        if channels != 0 {
+            hits.push(Hit { point, channels });
+        }
+    }
+}
+
+/// [`above`](super::kernel::above) in vectors of 16.
+#[target_feature(enable = "avx2")]
+pub(super) fn above_avx2(bounds: &[Bounds], bar: &Bounds, hits: &mut Vec<Hit>) {
+    let load = |bounds: &Bounds| {
+        let (low, high) = (bounds[..16].as_ptr(), bounds[16..].as_ptr());
+        // SAFETY: both halves of a block are 16 values.
+        unsafe { [_mm256_loadu_si256(low.cast()), _mm256_loadu_si256(high.cast())] }
+    };
+    let bar = load(bar);
+    for (point, bounds) in (0..).zip(bounds) {
+        let [low, high] = load(bounds);
+        let (low, high) = (_mm256_cmpgt_epi16(low, bar[0]), _mm256_cmpgt_epi16(high, bar[1]));
+        // Packing works on quarters of the two.
+        let bytes = _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi16(low, high));
+        let channels = _mm256_movemask_epi8(bytes).cast_unsigned();
+        if channels != 0 {
+            hits.push(Hit { point, channels });
         }
     }
 }
