@@ -10,13 +10,13 @@ use multiversion::multiversion;
 
 use super::Graph;
 use super::kernel::{
-    self, BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, dot, larger, leaky, whole_tiles,
+    self, BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE, dot, larger, leaky, whole_tiles,
 };
 use super::layer::{Features, blocks};
 use super::weights::Affine;
 
 /// Points that share a mean: where near points are near each other, their features differ less than those of all.
-const GROUP: usize = 128;
+const GROUP: usize = 32 * TILE;
 /// Largest byte of a centred feature, which is stored with `ZERO` added.
 const HIGHEST: f32 = 127.0;
 const ZERO: i32 = 128;
@@ -65,6 +65,7 @@ struct Map {
 #[derive(Debug, Default)]
 pub(super) struct PoolRoom {
     features: Quantized,
+    /// Of a group.
     sums: Vec<Sums>,
     /// Bounds of products, and of values.
     center: Vec<Bounds>,
@@ -142,7 +143,7 @@ impl PooledLayer {
         gamma: &mut Vec<f32>,
     ) {
         let points = graph.len();
-        room.sums.resize(whole_tiles(points), [0; 2 * BLOCK]);
+        room.sums.resize(GROUP, [0; 2 * BLOCK]);
         room.center.resize(points, [0; BLOCK]);
         room.neighbor.resize(points, [0; BLOCK]);
         room.upper.resize(points, [0; BLOCK]);
@@ -164,11 +165,15 @@ impl Block {
         let PoolRoom { features, sums, center, neighbor, .. } = room;
         let longest = self.center.length.iter().chain(&self.neighbor.length).copied().fold(0.0, f32::max);
         if longest * (reach.features + reach.rest) < BOUNDED {
-            kernel::multiply_quads(&features.quads, self.panel.len(), &self.panel, sums);
             let tops = [self.center.tops(reach), self.neighbor.tops(reach)];
             let units = std::array::from_fn(|l| tops[0][l].max(tops[1][l]) / f32::from(TOP));
-            bound::<0>(&self.center, reach, &units, features, sums, center);
-            bound::<1>(&self.neighbor, reach, &units, features, sums, neighbor);
+            let groups = features.groups(self.panel.len(), self.center.inputs());
+            let bounds = center.chunks_mut(GROUP).zip(neighbor.chunks_mut(GROUP));
+            for ((quads, rows, mean), (center, neighbor)) in groups.zip(bounds) {
+                kernel::multiply_quads(quads, self.panel.len(), &self.panel, sums);
+                bound::<0>(&self.center, reach, &units, mean, rows, sums, center);
+                bound::<1>(&self.neighbor, reach, &units, mean, rows, sums, neighbor);
+            }
             units
         } else {
             center.fill([TOP; BLOCK]);
@@ -321,25 +326,31 @@ fn bound<const HALF: usize>(
     map: &Map,
     reach: Reach,
     units: &Lanes,
-    features: &Quantized,
+    mean: &[f32],
+    rows: &[Row],
     sums: &[Sums],
     bounds: &mut [Bounds],
 ) {
     let slack = map.slack(reach);
     let scale = units.map(|unit| 1.0 / unit);
-    let groups = features.rows.chunks(GROUP).zip(features.means.chunks_exact(map.inputs()));
-    for (((rows, mean), sums), bounds) in groups.zip(sums.chunks(GROUP)).zip(bounds.chunks_mut(GROUP)) {
-        let base: Lanes = std::array::from_fn(|l| dot(map.row(l), mean) + map.shift[l] + slack[l]);
-        for ((row, sums), bounds) in rows.iter().zip(sums).zip(bounds) {
-            let mut rounded = [0; BLOCK];
-            for l in 0..BLOCK {
-                let product = (sums[HALF * BLOCK + l] - map.offset[l]) as f32 * row.unit * map.unit[l];
-                let bound = base[l] + product + (row.lost * map.length[l] + row.length * map.lost[l]);
-                // At least half a unit is left for what is rounded from here on.
-                rounded[l] = (bound * scale[l] + ROUND).to_bits() as i16 + 1;
-            }
-            *bounds = rounded;
+    let base: Lanes = std::array::from_fn(|l| dot(map.row(l), mean) + map.shift[l] + slack[l]);
+    for ((row, sums), bounds) in rows.iter().zip(sums).zip(bounds) {
+        let mut rounded = [0; BLOCK];
+        for l in 0..BLOCK {
+            let product = (sums[HALF * BLOCK + l] - map.offset[l]) as f32 * row.unit * map.unit[l];
+            let bound = base[l] + product + (row.lost * map.length[l] + row.length * map.lost[l]);
+            // At least half a unit is left for what is rounded from here on.
+            rounded[l] = (bound * scale[l] + ROUND).to_bits() as i16 + 1;
         }
+        *bounds = rounded;
+    }
+}
+
+impl Quantized {
+    /// Bytes, rows and mean of every group.
+    fn groups(&self, quads: usize, inputs: usize) -> impl Iterator<Item = (&[Quad], &[Row], &[f32])> {
+        let groups = self.quads.chunks(GROUP * quads).zip(self.rows.chunks(GROUP));
+        groups.zip(self.means.chunks_exact(inputs)).map(|((quads, rows), mean)| (quads, rows, mean))
     }
 }
 
