@@ -248,7 +248,10 @@ fn embed_by<const FUSED: bool>(
                 most[l] = larger(most[l], sums[l]);
             }
         }
-        *out = most.map(|v| leaky(v, slope));
+        for value in &mut most {
+            *value = leaky(*value, slope);
+        }
+        *out = most;
     }
 }
 

@@ -4,6 +4,7 @@
 //! edge. Batch norm with a positive scale and the leaky rectifier grow with their argument, so the maximum over the
 //! neighbours can be taken before them; a negative scale is folded into the weights first.
 
+use super::aligned::Aligned;
 use super::kernel::{self, BLOCK, Lanes, whole_tiles};
 use super::weights::Affine;
 use super::{Graph, InvariantInputs};
@@ -11,7 +12,7 @@ use super::{Graph, InvariantInputs};
 /// One row of features a point, `stride` values apart, in whole tiles.
 #[derive(Debug, Default)]
 pub(super) struct Features {
-    pub values: Vec<f32>,
+    pub values: Aligned<f32>,
     pub stride: usize,
 }
 
@@ -32,8 +33,8 @@ impl Features {
 /// The products of one block of channels.
 #[derive(Debug, Default)]
 pub(super) struct Products {
-    center: Vec<Lanes>,
-    neighbor: Vec<Lanes>,
+    center: Aligned<Lanes>,
+    neighbor: Aligned<Lanes>,
 }
 
 impl Products {
@@ -54,9 +55,9 @@ pub(super) struct GraphLayer {
 #[derive(Debug, Clone)]
 struct Block {
     /// W₁ − W₂
-    center: Vec<Lanes>,
+    center: Aligned<Lanes>,
     /// W₂
-    neighbor: Vec<Lanes>,
+    neighbor: Aligned<Lanes>,
     shift: Lanes,
 }
 
@@ -66,8 +67,8 @@ impl GraphLayer {
         let inputs = map.inputs / 2;
         let blocks = blocks(map.outputs)
             .map(|block| {
-                let neighbor: Vec<Lanes> = (0..inputs).map(|k| block.of(map.row(inputs + k))).collect();
-                let center = (0..inputs).zip(&neighbor).map(|(k, w2)| {
+                let neighbor: Aligned<Lanes> = (0..inputs).map(|k| block.of(map.row(inputs + k))).collect();
+                let center = (0..inputs).zip(neighbor.iter()).map(|(k, w2)| {
                     let w1 = block.of(map.row(k));
                     std::array::from_fn(|l| w1[l] - w2[l])
                 });
@@ -107,9 +108,9 @@ pub(super) struct Embedding {
 #[derive(Debug, Clone)]
 struct EmbeddingBlock {
     /// For what belongs to the edge.
-    edge: Vec<Lanes>,
+    edge: Aligned<Lanes>,
     /// For what its neighbour brings.
-    point: Vec<Lanes>,
+    point: Aligned<Lanes>,
     shift: Lanes,
 }
 

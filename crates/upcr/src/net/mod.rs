@@ -1,5 +1,6 @@
 //! The UPCR network (sections II-A and II-B of the paper): what it is made of, and its inference.
 
+mod aligned;
 mod config;
 mod graph;
 mod head;

@@ -9,6 +9,7 @@
 use multiversion::multiversion;
 
 use super::Graph;
+use super::aligned::Aligned;
 use super::kernel::{
     self, BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE, dot, larger, leaky, whole_tiles,
 };
@@ -16,7 +17,7 @@ use super::layer::{Features, blocks};
 use super::weights::Affine;
 
 /// Points that share a mean: where near points are near each other, their features differ less than those of all.
-const GROUP: usize = 32 * TILE;
+const GROUP: usize = 64 * TILE;
 /// Largest byte of a centred feature, which is stored with `ZERO` added.
 const HIGHEST: f32 = 127.0;
 const ZERO: i32 = 128;
@@ -42,7 +43,7 @@ pub(super) struct PooledLayer {
 #[derive(Debug, Clone)]
 struct Block {
     /// The center's weights in bytes, then the neighbour's.
-    panel: Vec<QuadLanes>,
+    panel: Aligned<QuadLanes>,
     center: Map,
     neighbor: Map,
 }
@@ -51,7 +52,7 @@ struct Block {
 #[derive(Debug, Clone)]
 struct Map {
     /// A row a channel.
-    weights: Vec<f32>,
+    weights: Aligned<f32>,
     shift: Lanes,
     /// ‖w‖, ‖u‖ and t, the first two rounded up.
     length: Lanes,
@@ -66,11 +67,11 @@ struct Map {
 pub(super) struct PoolRoom {
     features: Quantized,
     /// Of a group.
-    sums: Vec<Sums>,
+    sums: Aligned<Sums>,
     /// Bounds of products, and of values.
-    center: Vec<Bounds>,
-    neighbor: Vec<Bounds>,
-    upper: Vec<Bounds>,
+    center: Aligned<Bounds>,
+    neighbor: Aligned<Bounds>,
+    upper: Aligned<Bounds>,
     hits: Vec<Hit>,
     /// The neighbour's products, where a point's bits say that they are known.
     products: Vec<Lanes>,
@@ -83,9 +84,9 @@ struct Quantized {
     quads: Vec<Quad>,
     rows: Vec<Row>,
     /// A row a group.
-    means: Vec<f32>,
+    means: Aligned<f32>,
     /// Scratch: a row's distance from its mean, then r.
-    rest: Vec<f32>,
+    rest: Aligned<f32>,
 }
 
 /// s, ‖s·q‖ and ‖r‖ of a point, the lengths rounded up.
@@ -118,7 +119,8 @@ impl PooledLayer {
                     std::array::from_fn(|l| w1[l] - w2[l])
                 });
                 let center: Vec<Lanes> = center.collect();
-                let mut panel = vec![[[0; 4]; 2 * BLOCK]; inputs.div_ceil(4)];
+                let mut panel = Aligned::default();
+                panel.resize(inputs.div_ceil(4), [[0; 4]; 2 * BLOCK]);
                 let center = Map::new(&center, block.of(&map.shift), &mut panel, 0);
                 let neighbor = Map::new(&w2, [0.0; BLOCK], &mut panel, BLOCK);
                 Block { panel, center, neighbor }
@@ -260,7 +262,7 @@ impl Map {
     fn new(rows: &[Lanes], shift: Lanes, panel: &mut [QuadLanes], at: usize) -> Self {
         let highest = kernel::highest_weight();
         let mut map = Self {
-            weights: Vec::with_capacity(BLOCK * rows.len()),
+            weights: (0..BLOCK).flat_map(|l| rows.iter().map(move |row| row[l])).collect(),
             shift,
             length: [0.0; BLOCK],
             lost: [0.0; BLOCK],
@@ -283,7 +285,6 @@ impl Map {
             map.length[l] = rounded_up(length_sq.sqrt());
             map.lost[l] = rounded_up(lost_sq.sqrt());
             map.unit[l] = unit;
-            map.weights.extend(weights);
         }
         map
     }
@@ -366,8 +367,8 @@ fn quantize(input: &Features, inputs: usize, points: usize, quantized: &mut Quan
     quads.resize(whole_tiles(points) * quads_a_row, [0; 4]);
     rows.clear();
     rest.resize(inputs, 0.0);
-    means.clear();
     means.resize(points.div_ceil(GROUP) * inputs, 0.0);
+    means.fill(0.0);
     let mut reach = Reach { features: 0.0, rest: 0.0 };
     let features = input.values[..points * input.stride].chunks(GROUP * input.stride);
     let groups = features.zip(quads.chunks_mut(GROUP * quads_a_row)).zip(means.chunks_exact_mut(inputs));
