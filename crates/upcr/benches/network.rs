@@ -1,8 +1,11 @@
-//! Inference of a network of the default size, with random weights, on points scattered over a bumpy torus.
+//! Inference of a network of the default size, with random weights, on points scattered over a bumpy torus. With
+//! `--json POINTS REPEATS` it prints what predicting one pair takes; `bench/inference.py` holds that against a plain
+//! PyTorch form.
 
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use std::f32::consts::TAU;
+use std::time::Instant;
 
 use divan::Bencher;
 use rand::{Rng, SeedableRng};
@@ -14,7 +17,30 @@ use weights::{Precision, WeightsFile};
 mod weights;
 
 fn main() {
-    divan::main();
+    let arguments: Vec<String> = std::env::args().collect();
+    let numbers = arguments.iter().skip_while(|a| *a != "--json").skip(1).map_while(|a| a.parse().ok());
+    match *numbers.collect::<Vec<usize>>() {
+        [points, repeats, ..] if repeats > 0 => print_json(points, repeats),
+        _ => divan::main(),
+    }
+}
+
+fn print_json(points: usize, repeats: usize) {
+    let (network, source, target) = (network(), bumpy_torus(points, 1), bumpy_torus(points, 2));
+    let time_ms = |_| {
+        let start = Instant::now();
+        divan::black_box(network.predict(&source, &target)).unwrap();
+        start.elapsed().as_secs_f64() * 1e3
+    };
+    // The first runs find room.
+    let mut times_ms: Vec<f64> = (0..repeats + 3).map(time_ms).skip(3).collect();
+    times_ms.sort_by(f64::total_cmp);
+    println!(
+        "{{\"points\": {points}, \"ms_median\": {:.3}, \"ms_min\": {:.3}, \"threads\": {}}}",
+        times_ms[times_ms.len() / 2],
+        times_ms[0],
+        rayon::current_num_threads()
+    );
 }
 
 fn bumpy_torus(n: usize, seed: u64) -> Vec<[f32; 3]> {

@@ -3,6 +3,8 @@
 use multiversion::{multiversion, target::target_cfg_f};
 
 use super::Graph;
+#[cfg(target_arch = "x86_64")]
+use super::simd;
 
 /// Channels that are worked on together: their products over a cloud stay in cache until they are gathered.
 pub(super) const BLOCK: usize = 32;
@@ -12,33 +14,46 @@ pub(super) const TILE: usize = 6;
 /// One value of a block's channels each.
 pub(super) type Lanes = [f32; BLOCK];
 
+/// Four values of a row, in bytes.
+pub(super) type Quad = [u8; 4];
+/// Four weights of each channel, of a block's two products one after the other.
+pub(super) type QuadLanes = [[i8; 4]; 2 * BLOCK];
+/// Inner products of quads.
+pub(super) type Sums = [i32; 2 * BLOCK];
+/// Upper bounds of a block's products or values.
+pub(super) type Bounds = [i16; BLOCK];
+
+/// A point, and a bit for each channel of a block.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Hit {
+    pub point: u32,
+    pub channels: u32,
+}
+
+/// Whether every processor that this is built for multiplies and adds in one step.
+const FUSED: bool = cfg!(any(target_feature = "fma", target_arch = "aarch64"));
+
 /// The number of rows that hold `points` in whole tiles.
 pub(super) fn whole_tiles(points: usize) -> usize {
     points.next_multiple_of(TILE)
 }
 
 /// `out[i] = init + Σₖ rows[i·stride + k] · panel[k]`, for whole tiles of rows.
-#[multiversion(targets("x86_64+avx512f+avx512vl+fma", "x86_64+avx2+fma"))]
 pub(super) fn multiply(rows: &[f32], stride: usize, panel: &[Lanes], init: &Lanes, out: &mut [Lanes]) {
-    const WIDE: bool = target_cfg_f!(target_feature = "avx512f");
-    const FUSED: bool = target_cfg_f!(any(target_feature = "fma", target_arch = "aarch64"));
-    // As many accumulators as the registers hold: two vectors for each row of a tile.
-    match (WIDE, FUSED) {
-        (true, _) => multiply_by::<32, true>(rows, stride, panel, init, out),
-        (_, true) => multiply_by::<16, true>(rows, stride, panel, init, out),
-        _ => multiply_by::<8, false>(rows, stride, panel, init, out),
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") {
+        // SAFETY: the processor has what it needs.
+        return unsafe { simd::multiply_avx512(rows, stride, panel, init, out) };
+    } else if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+        // SAFETY: as above.
+        return unsafe { simd::multiply_avx2(rows, stride, panel, init, out) };
     }
+    multiply_portable(rows, stride, panel, init, out);
 }
 
-/// `WIDTH` channels at a time; `FUSED` where the processor multiplies and adds in one step.
-#[inline(always)]
-fn multiply_by<const WIDTH: usize, const FUSED: bool>(
-    rows: &[f32],
-    stride: usize,
-    panel: &[Lanes],
-    init: &Lanes,
-    out: &mut [Lanes],
-) {
+fn multiply_portable(rows: &[f32], stride: usize, panel: &[Lanes], init: &Lanes, out: &mut [Lanes]) {
+    /// Two vectors of four for each row of a tile fill the registers.
+    const WIDTH: usize = 8;
     for at in (0..BLOCK).step_by(WIDTH) {
         let mut start = [0.0; WIDTH];
         start.copy_from_slice(&init[at..at + WIDTH]);
@@ -51,7 +66,7 @@ fn multiply_by<const WIDTH: usize, const FUSED: bool>(
                 w.copy_from_slice(&weights[at..at + WIDTH]);
                 for (sums, &x) in sums.iter_mut().zip([a, b, c, d, e, f]) {
                     for l in 0..WIDTH {
-                        sums[l] = if FUSED { x.mul_add(w[l], sums[l]) } else { x * w[l] + sums[l] };
+                        sums[l] = multiply_add::<FUSED>(x, w[l], sums[l]);
                     }
                 }
             }
@@ -59,6 +74,89 @@ fn multiply_by<const WIDTH: usize, const FUSED: bool>(
                 out[at..at + WIDTH].copy_from_slice(sums);
             }
         }
+    }
+}
+
+/// `x·w + sum`; `FUSED` where the processor multiplies and adds in one step.
+#[inline(always)]
+fn multiply_add<const FUSED: bool>(x: f32, w: f32, sum: f32) -> f32 {
+    if FUSED { x.mul_add(w, sum) } else { x * w + sum }
+}
+
+/// An inner product of two rows of one length: a block's lanes are summed apart, then added half to half.
+pub(super) fn dot(a: &[f32], b: &[f32]) -> f32 {
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("fma") {
+        // SAFETY: the processor has what it needs.
+        return unsafe { simd::dot_avx512(a, b) };
+    } else if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+        // SAFETY: as above.
+        return unsafe { simd::dot_avx2(a, b) };
+    }
+    dot_portable(a, b)
+}
+
+fn dot_portable(a: &[f32], b: &[f32]) -> f32 {
+    let ((a, rest_a), (b, rest_b)) = (a.as_chunks::<BLOCK>(), b.as_chunks::<BLOCK>());
+    let mut sums = [0.0; BLOCK];
+    for (a, b) in a.iter().zip(b) {
+        for l in 0..BLOCK {
+            sums[l] = multiply_add::<FUSED>(a[l], b[l], sums[l]);
+        }
+    }
+    for (sum, (a, b)) in sums.iter_mut().zip(rest_a.iter().zip(rest_b)) {
+        *sum = multiply_add::<FUSED>(*a, *b, *sum);
+    }
+    let mut half = BLOCK / 2;
+    while half > 0 {
+        for l in 0..half {
+            sums[l] += sums[l + half];
+        }
+        half /= 2;
+    }
+    sums[0]
+}
+
+/// `out[i] = Σₖ rows[i·stride + k] · panel[k]`, for whole tiles of rows, exactly: quads are inner products of four
+/// bytes. Those of the panel lie within ±[`highest_weight`].
+pub(super) fn multiply_quads(rows: &[Quad], stride: usize, panel: &[QuadLanes], out: &mut [Sums]) {
+    #[cfg(target_arch = "x86_64")]
+    if has_quads() {
+        // SAFETY: the processor has what it needs.
+        return unsafe { simd::multiply_quads_avx512(rows, stride, panel, out) };
+    } else if is_x86_feature_detected!("avx2") {
+        // SAFETY: as above.
+        return unsafe { simd::multiply_quads_avx2(rows, stride, panel, out) };
+    }
+    multiply_quads_portable(rows, stride, panel, out);
+}
+
+/// The largest weight of a quad that this processor multiplies exactly.
+pub(super) fn highest_weight() -> f64 {
+    #[cfg(target_arch = "x86_64")]
+    if !has_quads() && is_x86_feature_detected!("avx2") {
+        // Two products with a byte have to fit into 16 bits.
+        return 64.0;
+    }
+    127.0
+}
+
+#[cfg(target_arch = "x86_64")]
+fn has_quads() -> bool {
+    is_x86_feature_detected!("avx512vnni") && is_x86_feature_detected!("avx512f")
+}
+
+fn multiply_quads_portable(rows: &[Quad], stride: usize, panel: &[QuadLanes], out: &mut [Sums]) {
+    for (row, out) in rows.chunks_exact(stride).zip(out) {
+        let mut sums = [0; 2 * BLOCK];
+        for (x, weights) in row.iter().zip(panel) {
+            let x = x.map(i32::from);
+            for (sum, w) in sums.iter_mut().zip(weights) {
+                let w = w.map(i32::from);
+                *sum += x[0] * w[0] + x[1] * w[1] + x[2] * w[2] + x[3] * w[3];
+            }
+        }
+        *out = sums;
     }
 }
 
@@ -73,26 +171,14 @@ pub(super) fn gather(
     out: &mut [f32],
     stride: usize,
 ) {
-    for ((row, center), out) in graph.rows().zip(center).zip(out.chunks_mut(stride)) {
-        let most = largest(neighbor, row);
+    let out = out.chunks_mut(stride).filter_map(<[f32]>::first_chunk_mut::<BLOCK>);
+    for ((row, center), out) in graph.rows().zip(center).zip(out) {
+        let mut values = largest(neighbor, row);
         for l in 0..BLOCK {
-            out[l] = leaky(center[l] + most[l], slope);
+            values[l] = leaky(center[l] + values[l], slope);
         }
+        *out = values;
     }
-}
-
-/// The maximum over all points of what [`gather`] gives.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
-pub(super) fn gather_all(center: &[Lanes], neighbor: &[Lanes], graph: &Graph, slope: f32) -> Lanes {
-    let mut all = [f32::NEG_INFINITY; BLOCK];
-    for (row, center) in graph.rows().zip(center) {
-        let most = largest(neighbor, row);
-        for l in 0..BLOCK {
-            all[l] = larger(all[l], center[l] + most[l]);
-        }
-    }
-    // The rectifier grows: the largest value stays the largest.
-    all.map(|v| leaky(v, slope))
 }
 
 /// The channels' largest values over the points in `row`.
@@ -110,7 +196,7 @@ fn largest(values: &[Lanes], row: &[u32]) -> Lanes {
 
 /// One instruction, unlike `f32::max`, which minds NaN.
 #[inline(always)]
-fn larger(a: f32, b: f32) -> f32 {
+pub(super) fn larger(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }
 
@@ -147,22 +233,160 @@ fn embed_by<const FUSED: bool>(
     stride: usize,
 ) {
     let dim = weights.len();
-    for (i, (row, out)) in graph.rows().zip(out.chunks_mut(stride)).enumerate() {
+    let out = out.chunks_mut(stride).filter_map(<[f32]>::first_chunk_mut::<BLOCK>);
+    for (i, (row, out)) in graph.rows().zip(out).enumerate() {
         let mut most = [f32::NEG_INFINITY; BLOCK];
         for (slot, &j) in row.iter().enumerate() {
             let mut sums = neighbor[j as usize];
             let values = &edges[(i * graph.k + slot) * dim..][..dim];
             for (&x, w) in values.iter().zip(weights) {
                 for l in 0..BLOCK {
-                    sums[l] = if FUSED { x.mul_add(w[l], sums[l]) } else { x * w[l] + sums[l] };
+                    sums[l] = multiply_add::<FUSED>(x, w[l], sums[l]);
                 }
             }
             for l in 0..BLOCK {
                 most[l] = larger(most[l], sums[l]);
             }
         }
-        for l in 0..BLOCK {
-            out[l] = leaky(most[l], slope);
+        for value in &mut most {
+            *value = leaky(*value, slope);
+        }
+        *out = most;
+    }
+}
+
+/// Finds the points and channels whose bounds exceed `bar`.
+pub(super) fn above(bounds: &[Bounds], bar: &Bounds, hits: &mut Vec<Hit>) {
+    hits.clear();
+    #[cfg(target_arch = "x86_64")]
+    if is_x86_feature_detected!("avx512bw") {
+        // SAFETY: the processor has what it needs.
+        return unsafe { simd::above_avx512(bounds, bar, hits) };
+    } else if is_x86_feature_detected!("avx2") {
+        // SAFETY: as above.
+        return unsafe { simd::above_avx2(bounds, bar, hits) };
+    }
+    above_portable(bounds, bar, hits);
+}
+
+fn above_portable(bounds: &[Bounds], bar: &Bounds, hits: &mut Vec<Hit>) {
+    for (point, bounds) in (0..).zip(bounds) {
+        let above = (0..BLOCK).filter(|&l| bounds[l] > bar[l]);
+        let channels = above.fold(0, |channels, l| channels | 1 << l);
+        if channels != 0 {
+            hits.push(Hit { point, channels });
+        }
+    }
+}
+
+#[cfg(all(test, target_arch = "x86_64"))]
+mod tests {
+    use rand::{Rng, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    const POINTS: usize = 5 * TILE;
+
+    /// Rows of 1 to 70 values, of which products and sums are exact.
+    fn rows(rng: &mut ChaCha8Rng) -> (usize, Vec<f32>) {
+        let stride = rng.random_range(1..70);
+        (stride, (0..POINTS * stride).map(|_| f32::from(rng.random_range(-20_i8..20))).collect())
+    }
+
+    #[test]
+    fn products_are_the_same_in_every_instruction_set() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        for _ in 0..50 {
+            let (stride, rows) = rows(&mut rng);
+            let panel: Vec<Lanes> =
+                (0..stride).map(|k| std::array::from_fn(|l| ((k * 31 + l * 7) % 23) as f32 - 11.0)).collect();
+            let init = std::array::from_fn(|l| l as f32);
+            let mut expected = vec![[0.0; BLOCK]; POINTS];
+            multiply_portable(&rows, stride, &panel, &init, &mut expected);
+            let mut found = vec![[0.0; BLOCK]; POINTS];
+            if is_x86_feature_detected!("avx512f") {
+                // SAFETY: the processor has what it needs.
+                unsafe { simd::multiply_avx512(&rows, stride, &panel, &init, &mut found) };
+                assert_eq!(found, expected);
+            }
+            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+                found.fill([0.0; BLOCK]);
+                // SAFETY: as above.
+                unsafe { simd::multiply_avx2(&rows, stride, &panel, &init, &mut found) };
+                assert_eq!(found, expected);
+            }
+        }
+    }
+
+    #[test]
+    fn inner_products_are_the_same_in_every_instruction_set() {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        for _ in 0..50 {
+            let (stride, rows) = rows(&mut rng);
+            let (a, b) = (&rows[..stride], &rows[stride..2 * stride]);
+            let expected = dot_portable(a, b);
+            assert_eq!(expected, a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>());
+            if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("fma") {
+                // SAFETY: the processor has what it needs.
+                assert_eq!(unsafe { simd::dot_avx512(a, b) }, expected);
+            }
+            if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
+                // SAFETY: as above.
+                assert_eq!(unsafe { simd::dot_avx2(a, b) }, expected);
+            }
+        }
+    }
+
+    #[test]
+    fn products_of_bytes_are_the_same_in_every_instruction_set() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let most = 64;
+        for round in 0..50 {
+            let stride = rng.random_range(1..40);
+            // The last rounds are of extreme values alone.
+            let mut byte = || if round < 40 { rng.random() } else { u8::MAX };
+            let rows: Vec<Quad> = (0..POINTS * stride).map(|_| std::array::from_fn(|_| byte())).collect();
+            let mut weight =
+                || if round < 40 { rng.random_range(-most..=most) } else { [-most, most][round % 2] };
+            let panel: Vec<QuadLanes> =
+                (0..stride).map(|_| std::array::from_fn(|_| std::array::from_fn(|_| weight()))).collect();
+            let mut expected = vec![[0; 2 * BLOCK]; POINTS];
+            multiply_quads_portable(&rows, stride, &panel, &mut expected);
+            let mut found = vec![[0; 2 * BLOCK]; POINTS];
+            if has_quads() {
+                // SAFETY: the processor has what it needs.
+                unsafe { simd::multiply_quads_avx512(&rows, stride, &panel, &mut found) };
+                assert_eq!(found, expected);
+            }
+            if is_x86_feature_detected!("avx2") {
+                found.fill([0; 2 * BLOCK]);
+                // SAFETY: as above.
+                unsafe { simd::multiply_quads_avx2(&rows, stride, &panel, &mut found) };
+                assert_eq!(found, expected);
+            }
+        }
+    }
+
+    #[test]
+    fn points_above_a_bar_are_the_same_in_every_instruction_set() {
+        let mut rng = ChaCha8Rng::seed_from_u64(4);
+        let mut bounds = || -> Bounds { std::array::from_fn(|_| rng.random_range(-3..3) * 10_000) };
+        for _ in 0..50 {
+            let (rows, bar): (Vec<_>, _) = ((0..20).map(|_| bounds()).collect(), bounds());
+            let [mut expected, mut found] = [vec![], vec![]];
+            above_portable(&rows, &bar, &mut expected);
+            if is_x86_feature_detected!("avx512bw") {
+                // SAFETY: the processor has what it needs.
+                unsafe { simd::above_avx512(&rows, &bar, &mut found) };
+                assert_eq!(found, expected);
+            }
+            if is_x86_feature_detected!("avx2") {
+                found.clear();
+                // SAFETY: as above.
+                unsafe { simd::above_avx2(&rows, &bar, &mut found) };
+                assert_eq!(found, expected);
+            }
         }
     }
 }

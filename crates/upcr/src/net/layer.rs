@@ -4,6 +4,7 @@
 //! edge. Batch norm with a positive scale and the leaky rectifier grow with their argument, so the maximum over the
 //! neighbours can be taken before them; a negative scale is folded into the weights first.
 
+use super::aligned::Aligned;
 use super::kernel::{self, BLOCK, Lanes, whole_tiles};
 use super::weights::Affine;
 use super::{Graph, InvariantInputs};
@@ -11,7 +12,7 @@ use super::{Graph, InvariantInputs};
 /// One row of features a point, `stride` values apart, in whole tiles.
 #[derive(Debug, Default)]
 pub(super) struct Features {
-    pub values: Vec<f32>,
+    pub values: Aligned<f32>,
     pub stride: usize,
 }
 
@@ -32,8 +33,8 @@ impl Features {
 /// The products of one block of channels.
 #[derive(Debug, Default)]
 pub(super) struct Products {
-    center: Vec<Lanes>,
-    neighbor: Vec<Lanes>,
+    center: Aligned<Lanes>,
+    neighbor: Aligned<Lanes>,
 }
 
 impl Products {
@@ -46,7 +47,6 @@ impl Products {
 /// A layer over the graph, packed for inference.
 #[derive(Debug, Clone)]
 pub(super) struct GraphLayer {
-    outputs: usize,
     slope: f32,
     blocks: Vec<Block>,
 }
@@ -55,9 +55,9 @@ pub(super) struct GraphLayer {
 #[derive(Debug, Clone)]
 struct Block {
     /// W₁ − W₂
-    center: Vec<Lanes>,
+    center: Aligned<Lanes>,
     /// W₂
-    neighbor: Vec<Lanes>,
+    neighbor: Aligned<Lanes>,
     shift: Lanes,
 }
 
@@ -67,15 +67,15 @@ impl GraphLayer {
         let inputs = map.inputs / 2;
         let blocks = blocks(map.outputs)
             .map(|block| {
-                let neighbor: Vec<Lanes> = (0..inputs).map(|k| block.of(map.row(inputs + k))).collect();
-                let center = (0..inputs).zip(&neighbor).map(|(k, w2)| {
+                let neighbor: Aligned<Lanes> = (0..inputs).map(|k| block.of(map.row(inputs + k))).collect();
+                let center = (0..inputs).zip(neighbor.iter()).map(|(k, w2)| {
                     let w1 = block.of(map.row(k));
                     std::array::from_fn(|l| w1[l] - w2[l])
                 });
                 Block { center: center.collect(), shift: block.of(&map.shift), neighbor }
             })
             .collect();
-        Self { outputs: map.outputs, slope, blocks }
+        Self { slope, blocks }
     }
 
     /// The layer's features from those of the layer before it.
@@ -86,17 +86,6 @@ impl GraphLayer {
             let (out, stride) = (&mut output.values[b * BLOCK..], output.stride);
             kernel::gather(&products.center, &products.neighbor, graph, self.slope, out, stride);
         }
-    }
-
-    /// The maximum over all points of the layer's features.
-    pub fn pool(&self, input: &Features, graph: &Graph, products: &mut Products, gamma: &mut Vec<f32>) {
-        gamma.clear();
-        for block in &self.blocks {
-            block.multiply(input, graph.len(), products);
-            let all = kernel::gather_all(&products.center, &products.neighbor, graph, self.slope);
-            gamma.extend(all);
-        }
-        gamma.truncate(self.outputs);
     }
 }
 
@@ -119,9 +108,9 @@ pub(super) struct Embedding {
 #[derive(Debug, Clone)]
 struct EmbeddingBlock {
     /// For what belongs to the edge.
-    edge: Vec<Lanes>,
+    edge: Aligned<Lanes>,
     /// For what its neighbour brings.
-    point: Vec<Lanes>,
+    point: Aligned<Lanes>,
     shift: Lanes,
 }
 
@@ -167,15 +156,15 @@ impl Embedding {
 }
 
 /// A block of a layer's channels.
-struct Channels(usize);
+pub(super) struct Channels(usize);
 
-fn blocks(channels: usize) -> impl Iterator<Item = Channels> {
+pub(super) fn blocks(channels: usize) -> impl Iterator<Item = Channels> {
     (0..channels).step_by(BLOCK).map(Channels)
 }
 
 impl Channels {
     /// The block's part of one value a channel, zero beyond the last.
-    fn of(&self, values: &[f32]) -> Lanes {
+    pub fn of(&self, values: &[f32]) -> Lanes {
         std::array::from_fn(|l| values.get(self.0 + l).copied().unwrap_or(0.0))
     }
 }

@@ -1,5 +1,6 @@
 //! The UPCR network (sections II-A and II-B of the paper): what it is made of, and its inference.
 
+mod aligned;
 mod config;
 mod graph;
 mod head;
@@ -7,7 +8,10 @@ mod invariant;
 mod kernel;
 mod layer;
 mod network;
+mod pool;
 mod search;
+#[cfg(target_arch = "x86_64")]
+mod simd;
 mod weights;
 
 pub use config::{GraphKind, NetworkConfig, RotationKind};

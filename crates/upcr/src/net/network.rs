@@ -7,6 +7,7 @@ use nalgebra::Vector3;
 
 use super::head::Head;
 use super::layer::{Embedding, Features, GraphLayer, Products};
+use super::pool::{PoolRoom, PooledLayer};
 use super::search::{SearchRoom, nearest, nearest_features};
 use super::weights::Weights;
 use super::{Graph, GraphKind, Invariant, InvariantInputs, NetworkConfig};
@@ -20,7 +21,7 @@ pub struct Network {
     config: NetworkConfig,
     trained: bool,
     fingerprint: u64,
-    global: Vec<GraphLayer>,
+    global: Branch,
     invariant: Option<InvariantBranch>,
     head: Head,
     rooms: Rooms,
@@ -37,7 +38,14 @@ impl PartialEq for Network {
 #[derive(Debug, Clone)]
 struct InvariantBranch {
     embedding: Embedding,
+    branch: Branch,
+}
+
+/// Graph layers; of the last only the maximum over all points is wanted.
+#[derive(Debug, Clone)]
+struct Branch {
     layers: Vec<GraphLayer>,
+    last: PooledLayer,
 }
 
 /// What a network makes of one cloud.
@@ -65,20 +73,23 @@ impl Network {
         let weights = Weights::open(bytes)?;
         let config = weights.config.clone();
         let slope = config.negative_slope;
-        let layers = |branch: &str, inputs: usize| {
+        let branch = |name: &str, inputs: usize| {
             let inputs = std::iter::once(inputs).chain(config.widths.iter().copied());
-            let layer = |(l, (inputs, &outputs))| {
-                Ok(GraphLayer::new(&weights.edge_map(&format!("{branch}.{l}"), 2 * inputs, outputs)?, slope))
+            let map = |(l, (inputs, &outputs))| weights.edge_map(&format!("{name}.{l}"), 2 * inputs, outputs);
+            let maps = inputs.zip(&config.widths).enumerate().map(map).collect::<Result<Vec<_>>>()?;
+            let Some((last, maps)) = maps.split_last() else {
+                return Err(Error::InvalidWeights { reason: "no graph layer".into() });
             };
-            inputs.zip(&config.widths).enumerate().map(layer).collect::<Result<Vec<_>>>()
+            let layers = maps.iter().map(|map| GraphLayer::new(map, slope)).collect();
+            Ok(Branch { layers, last: PooledLayer::new(last, slope) })
         };
-        let global = layers("global", 3)?;
+        let global = branch("global", 3)?;
         let mut invariant = None;
         if config.invariant != Invariant::None {
             let (edge_dim, point_dim) = (config.invariant.edge_dim(), config.invariant.point_dim());
             let map = weights.edge_map("invariant.embed", edge_dim + point_dim, config.widths[0])?;
             let embedding = Embedding::new(&map, edge_dim, slope);
-            invariant = Some(InvariantBranch { embedding, layers: layers("invariant", config.widths[0])? });
+            invariant = Some(InvariantBranch { embedding, branch: branch("invariant", config.widths[0])? });
         }
         let values = config.rotation.values() + 3;
         let inputs = std::iter::once(config.representation()).chain(config.head.iter().copied());
@@ -196,11 +207,11 @@ impl Network {
                 self.branch(&self.global, 3, graph, order, global, global_gamma);
             },
             || {
-                if let Some(InvariantBranch { embedding, layers }) = &self.invariant {
+                if let Some(InvariantBranch { embedding, branch }) = &self.invariant {
                     let BranchRoom { features, next, products, .. } = invariant;
                     embedding.apply(inputs, graph, next, products, features);
                     let channels = self.config.widths[0];
-                    self.branch(layers, channels, graph, order, invariant, invariant_gamma);
+                    self.branch(branch, channels, graph, order, invariant, invariant_gamma);
                 }
             },
         );
@@ -236,29 +247,40 @@ impl Network {
     /// A branch's representation from the features that lie ready in `room`.
     fn branch(
         &self,
-        layers: &[GraphLayer],
+        branch: &Branch,
         mut channels: usize,
         graph: &Graph,
         order: &[u32],
         room: &mut BranchRoom,
         gamma: &mut Vec<f32>,
     ) {
-        let BranchRoom { features, next, products, search, .. } = room;
-        for (l, (layer, &outputs)) in layers.iter().zip(&self.config.widths).enumerate() {
-            let graph = match self.config.graph {
-                GraphKind::Static => graph,
-                GraphKind::Dynamic => {
-                    nearest_features(features, channels, self.config.k, order, &mut room.graph, search);
-                    &room.graph
-                }
-            };
-            if l + 1 < layers.len() {
-                layer.apply(features, graph, products, next);
-                std::mem::swap(features, next);
-            } else {
-                layer.pool(features, graph, products, gamma);
-            }
+        let BranchRoom { features, next, products, pool, graph: own, search } = room;
+        for (layer, &outputs) in branch.layers.iter().zip(&self.config.widths) {
+            let graph = self.neighbors(features, channels, graph, order, own, search);
+            layer.apply(features, graph, products, next);
+            std::mem::swap(features, next);
             channels = outputs;
+        }
+        let graph = self.neighbors(features, channels, graph, order, own, search);
+        branch.last.apply(features, graph, pool, gamma);
+    }
+
+    /// The graph of a layer: `graph`, or `own`, filled with that of the layer's features.
+    fn neighbors<'a>(
+        &self,
+        features: &Features,
+        channels: usize,
+        graph: &'a Graph,
+        order: &[u32],
+        own: &'a mut Graph,
+        search: &mut SearchRoom,
+    ) -> &'a Graph {
+        match self.config.graph {
+            GraphKind::Static => graph,
+            GraphKind::Dynamic => {
+                nearest_features(features, channels, self.config.k, order, own, search);
+                own
+            }
         }
     }
 
@@ -339,6 +361,7 @@ struct BranchRoom {
     features: Features,
     next: Features,
     products: Products,
+    pool: PoolRoom,
     graph: Graph,
     search: SearchRoom,
 }

@@ -3,6 +3,7 @@
 use multiversion::multiversion;
 
 use super::Graph;
+use super::aligned::Aligned;
 use super::kernel::{self, BLOCK, Lanes, whole_tiles};
 use super::layer::Features;
 use crate::neighbors::Neighbor;
@@ -24,8 +25,8 @@ pub(super) struct SearchRoom {
     hits: Vec<u32>,
     found: Vec<Neighbor>,
     /// Of a block of features the columns, of all features their inner products with those and their squared lengths.
-    panel: Vec<Lanes>,
-    inner: Vec<Lanes>,
+    panel: Aligned<Lanes>,
+    inner: Aligned<Lanes>,
     squares: Vec<f32>,
     /// A row a point, as they rank.
     ranks: Vec<u64>,
