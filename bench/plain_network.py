@@ -187,11 +187,13 @@ def chamfer_loss(points: Tensor, sizes: list[int], rotations: Tensor, translatio
     return loss / pairs
 
 
-def train_step(network: Network, optimizer: torch.optim.Optimizer, points: Tensor, sizes: list[int]) -> float:
+def train_step(
+    network: Network, optimizer: torch.optim.Optimizer, points: Tensor, sizes: list[int], graph: Tensor | None = None
+) -> float:
     """One step on all sources and then all targets; batch norm sees all clouds together."""
     network.train()
     optimizer.zero_grad()
-    loss = chamfer_loss(points, sizes, *network(points, sizes))
+    loss = chamfer_loss(points, sizes, *network(points, sizes, graph))
     loss.backward()
     optimizer.step()
     return loss.item()

@@ -24,6 +24,8 @@ const COARSE_CANDIDATES: usize = 8;
 const FINE_CANDIDATES: usize = 3;
 /// A hypothesis that scores less than this share of the best is not looked at further.
 const PROMISING: f64 = 0.7;
+/// Where points lie on each other as closely as this, no other pose can look as right.
+const COINCIDENT: f64 = 0.95;
 /// Points that score a raw hypothesis, that refine it coarsely, that score it then, and that score the result.
 const RANKING_POINTS: usize = 192;
 const COARSE_POINTS: usize = 300;
@@ -214,7 +216,9 @@ impl<'a> Pipeline<'a> {
         };
         let mut ranked = coarsely_refined(promising(hypotheses, 0.0));
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
-        if let Some((score, best)) = ranked.first() {
+        if let Some((score, best)) = ranked.first()
+            && *score < COINCIDENT
+        {
             let others = promising(&alternatives(&best.pose), PROMISING * score);
             ranked.extend(coarsely_refined(others));
             ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -244,9 +248,8 @@ impl<'a> Pipeline<'a> {
                 &Schedule { max_iterations: 0, ..Schedule::settled(reach, keep) },
             )
         } else {
-            // A guess, or a network's, may be further off than a pose that matches agree on.
-            let rough = matches!(hypothesis.method, Method::Prior | Method::Upcr);
-            let first = if rough { 3.0 * reach } else { 1.5 * reach };
+            // A guess may be further off than what the coarse level brings near.
+            let first = if hypothesis.method == Method::Prior { 3.0 * reach } else { 1.5 * reach };
             let found = icp.refine(&few, &hypothesis.pose, &Schedule::fine(first, reach, keep));
             if few.len() == moved.len() {
                 found

@@ -5,8 +5,9 @@ use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
 use super::{Hypothesis, HypothesisSource, Problem, drop_repeats};
 use crate::{net::Network, prepare::Level, settings::Method, transform::Rigid, verify::overlap_at};
 
-/// Points that the network sees, at most; as many as it learned from.
-const POINTS: usize = 1024;
+/// Points that the network learned from, and that it sees here at most: its pose is only a first one.
+const LEARNED_POINTS: usize = 1024;
+const POINTS: usize = 512;
 /// Passes at most.
 const PASSES: usize = 4;
 /// Points that tell how close the clouds are, and the share of the larger cloud's radius that counts as far.
@@ -60,16 +61,21 @@ impl HypothesisSource for Upcr {
             let translation = pose.translation.map(|v| v as f32);
             points.iter().map(|&p| ((rotation * Vector3::from(p) + translation) * scale).into()).collect()
         };
-        let canonical_target = || network.canonical_pose(&scaled(&target_points, &Rigid::identity()));
-        let canonical_source = |pose: &Rigid| network.canonical_pose(&scaled(&source_points, pose));
+        let canonical = |points: &[[f32; 3]], pose: &Rigid| {
+            // Fewer neighbours reach as far among fewer points.
+            let k = (network.config().k * points.len()).div_ceil(LEARNED_POINTS);
+            network.canonical_pose(&scaled(points, pose), k)
+        };
+        let canonical_target = || canonical(&target_points, &Rigid::identity());
+        let canonical_source = |pose: &Rigid| canonical(&source_points, pose);
         let closeness = |pose: &Rigid| overlap_at(source, target, pose, JUDGED_POINTS, FAR * radius).score(2);
 
         let (mut pose, mut closest) = (problem.init, 0.0);
         let mut hypotheses: Vec<Hypothesis> = Vec::new();
         let (mut found, canonical_target) = rayon::join(|| canonical_source(&pose), canonical_target);
         let Ok(canonical_target) = canonical_target else { return Vec::new() };
-        while let Ok(canonical) = found {
-            let step = canonical_target * canonical.inverse();
+        while let Ok(canonical_source_pose) = found {
+            let step = canonical_target * canonical_source_pose.inverse();
             let next = Rigid { translation: step.translation * f64::from(radius), ..step } * pose;
             let closer = closeness(&next);
             if closer <= closest {

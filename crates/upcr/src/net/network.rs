@@ -160,18 +160,20 @@ impl Network {
     /// # Errors
     /// Where a cloud is empty or holds a coordinate that is not finite.
     pub fn predict(&self, source: &[[f32; 3]], target: &[[f32; 3]]) -> Result<Rigid> {
+        let pose = |cloud, role| self.pose(cloud, role, self.config.k);
         let (source, target) =
-            rayon::join(|| self.pose(source, CloudRole::Source), || self.pose(target, CloudRole::Target));
+            rayon::join(|| pose(source, CloudRole::Source), || pose(target, CloudRole::Target));
         Ok(target? * source?.inverse())
     }
 
     /// The pose of a cloud about the latent canonical shape, the two branches in parallel: that of a target times the
-    /// inverse of that of a source is what [`Self::predict`] gives.
+    /// inverse of that of a source is what [`Self::predict`] gives. A cloud with fewer points than those of training is
+    /// best seen with fewer neighbours `k`, that reach as far.
     ///
     /// # Errors
     /// Where the cloud is empty or holds a coordinate that is not finite.
-    pub fn canonical_pose(&self, cloud: &[[f32; 3]]) -> Result<Rigid> {
-        self.pose(cloud, CloudRole::Cloud)
+    pub fn canonical_pose(&self, cloud: &[[f32; 3]], k: usize) -> Result<Rigid> {
+        self.pose(cloud, CloudRole::Cloud, k.max(1))
     }
 
     /// Every cloud's representations.
@@ -180,14 +182,14 @@ impl Network {
     /// Where the cloud is empty or holds a coordinate that is not finite.
     pub fn representations(&self, cloud: &[[f32; 3]]) -> Result<Representations> {
         self.rooms.with(|room| {
-            self.run(cloud, CloudRole::Cloud, room)?;
+            self.run(cloud, CloudRole::Cloud, self.config.k, room)?;
             Ok(room.representations.clone())
         })
     }
 
-    fn pose(&self, cloud: &[[f32; 3]], role: CloudRole) -> Result<Rigid> {
+    fn pose(&self, cloud: &[[f32; 3]], role: CloudRole, k: usize) -> Result<Rigid> {
         self.rooms.with(|room| {
-            self.run(cloud, role, room)?;
+            self.run(cloud, role, k, room)?;
             let Representations { centroid, head, .. } = &room.representations;
             let about_centroid = self.head.pose(head);
             let translation = Vector3::from(*centroid) + about_centroid.translation;
@@ -196,9 +198,9 @@ impl Network {
     }
 
     /// Fills the room's representations.
-    fn run(&self, cloud: &[[f32; 3]], role: CloudRole, room: &mut Room) -> Result<()> {
+    fn run(&self, cloud: &[[f32; 3]], role: CloudRole, k: usize, room: &mut Room) -> Result<()> {
         check(cloud, role)?;
-        self.prepare(cloud, room)?;
+        self.prepare(cloud, k, room)?;
         let Room { representations, points, order, graph, inputs, global, invariant, values, .. } = room;
         let (global_gamma, invariant_gamma) = (&mut representations.global, &mut representations.invariant);
         rayon::join(
@@ -221,20 +223,20 @@ impl Network {
     }
 
     /// Moves the cloud to its centroid and finds neighbours and φ.
-    fn prepare(&self, cloud: &[[f32; 3]], room: &mut Room) -> Result<()> {
+    fn prepare(&self, cloud: &[[f32; 3]], k: usize, room: &mut Room) -> Result<()> {
         let Room { representations, points, order, graph, inputs, search, .. } = room;
         let o = centroid(cloud);
         representations.centroid = o;
         points.clear();
         points.extend(cloud.iter().map(|p| [0, 1, 2].map(|a| (f64::from(p[a]) - o[a]) as f32)));
         match self.config.invariant {
-            Invariant::None => nearest(points, self.config.k, order, graph, search),
+            Invariant::None => nearest(points, k, order, graph, search),
             Invariant::Distance => {
-                nearest(points, self.config.k, order, graph, search);
+                nearest(points, k, order, graph, search);
                 distances(points, graph, inputs);
             }
             other => {
-                let neighborhoods = KdTree::new(points).knn_graph(self.config.k);
+                let neighborhoods = KdTree::new(points).knn_graph(k);
                 *inputs = other.inputs(points, &neighborhoods)?;
                 *graph = Graph::from(&neighborhoods);
                 order.clear();
@@ -278,7 +280,7 @@ impl Network {
         match self.config.graph {
             GraphKind::Static => graph,
             GraphKind::Dynamic => {
-                nearest_features(features, channels, self.config.k, order, own, search);
+                nearest_features(features, channels, graph.k, order, own, search);
                 own
             }
         }
