@@ -1,10 +1,10 @@
 //! Neighbour graphs of the clouds that networks see: small, and searched as a whole.
 
-use multiversion::{multiversion, target::target_cfg_f};
+use multiversion::{multiversion, target::match_target};
 
 use super::Graph;
 use super::aligned::Aligned;
-use super::kernel::{self, BLOCK, Lanes, whole_tiles};
+use super::kernel::{self, BLOCK, Lanes, places, whole_tiles};
 use super::layer::Features;
 #[cfg(target_arch = "x86_64")]
 use super::simd;
@@ -113,18 +113,13 @@ fn sort(entries: &mut [Entry]) {
 
 /// Fills the rows of the graph.
 #[multiversion(targets("x86_64+avx512f+avx512vl+popcnt+bmi1", "x86_64+avx2+popcnt+bmi1"))]
-#[allow(unused_unsafe, reason = "of the copies, the portable one alone holds calls that are not safe")]
 fn fill(points: &[[f32; 3]], order: &[u32], graph: &mut Graph, room: &mut SearchRoom) {
-    let at_most = |values: &[f32; 16], most: f32| {
-        #[cfg(target_arch = "x86_64")]
-        if target_cfg_f!(target_feature = "avx512f") {
-            // SAFETY: the processor has what this copy is built for.
-            return unsafe { simd::at_most_avx512(values, most) };
-        } else if target_cfg_f!(target_feature = "avx2") {
-            // SAFETY: as above.
-            return unsafe { simd::at_most_avx2(values, most) };
+    let at_most = |values: &[f32; 16], most: f32| -> u32 {
+        match_target! {
+            "x86_64+avx512f" => simd::at_most_avx512(values, most),
+            "x86_64+avx2" => simd::at_most_avx2(values, most),
+            _ => kernel::at_most(values, most),
         }
-        (0..16).fold(0, |mask, l| mask | u16::from(values[l] <= most) << l)
     };
     let SearchRoom { leaves, boxes, near, distances_sq, .. } = room;
     let k = graph.k;
@@ -139,7 +134,7 @@ fn fill(points: &[[f32; 3]], order: &[u32], graph: &mut Graph, room: &mut Search
         });
         near.clear();
         for (start, group) in (0..).step_by(GROUP).zip(boxes.iter()) {
-            near.extend(places(at_most(&group.distances_sq(query), bound)).map(|leaf| start + leaf));
+            near.extend(places(at_most(&group.distances_sq(query), bound)).map(|leaf| start + leaf as u32));
         }
         distances_sq.clear();
         distances_sq.extend(near.iter().map(|&leaf| leaves[leaf as usize].distances_sq(query)));
@@ -147,7 +142,7 @@ fn fill(points: &[[f32; 3]], order: &[u32], graph: &mut Graph, room: &mut Search
         let radius_sq = radius_sq(count, k, bound);
         for (&leaf, distances_sq) in near.iter().zip(distances_sq.iter()) {
             let within = places(at_most(distances_sq, radius_sq));
-            graph.neighbors.extend(within.map(|place| leaf * LEAF as u32 + place));
+            graph.neighbors.extend(within.map(|place| leaf * LEAF as u32 + place as u32));
         }
         let row = &mut graph.neighbors[i * k..];
         if row.len() > k {
@@ -186,16 +181,6 @@ fn radius_sq(count: impl Fn(f32) -> usize, k: usize, bound: f32) -> f32 {
         step += 1;
     }
     f32::from_bits(high)
-}
-
-/// The places of the ones in `mask`.
-#[inline(always)]
-fn places(mut mask: u16) -> impl Iterator<Item = u32> {
-    std::iter::from_fn(move || {
-        let first = (mask != 0).then(|| mask.trailing_zeros());
-        mask &= mask.wrapping_sub(1);
-        first
-    })
 }
 
 impl Boxes {
