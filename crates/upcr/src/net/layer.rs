@@ -17,10 +17,10 @@ pub(super) struct Features {
 }
 
 impl Features {
-    /// Room for rows of `channels` values; what it holds is of no meaning.
+    /// Room for rows of `channels` values, or more; what it holds is of no meaning.
     pub fn reserve(&mut self, points: usize, channels: usize) {
         self.stride = channels;
-        self.values.resize(whole_tiles(points) * channels, 0.0);
+        self.values.resize(self.values.len().max(whole_tiles(points) * channels), 0.0);
     }
 
     /// Takes over rows of `channels` values.

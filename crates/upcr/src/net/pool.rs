@@ -11,7 +11,8 @@ use multiversion::multiversion;
 use super::Graph;
 use super::aligned::Aligned;
 use super::kernel::{
-    self, BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE, dot, larger, leaky, whole_tiles,
+    self, BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE, dot, larger, leaky, places, prefetch,
+    whole_tiles,
 };
 use super::layer::{Features, blocks};
 use super::weights::Affine;
@@ -73,6 +74,8 @@ pub(super) struct PoolRoom {
     neighbor: Aligned<Bounds>,
     upper: Aligned<Bounds>,
     hits: Vec<Hit>,
+    /// The center's values at the hits.
+    exact: Vec<f32>,
     /// The neighbour's products, where a point's bits say that they are known.
     products: Vec<Lanes>,
     known: Vec<u32>,
@@ -193,7 +196,7 @@ impl Block {
         graph: &Graph,
         room: &mut PoolRoom,
     ) -> Lanes {
-        let PoolRoom { center: centers, neighbor, upper, hits, products, known, .. } = room;
+        let PoolRoom { center: centers, neighbor, upper, hits, exact, products, known, .. } = room;
         let features = |i: usize| &input.values[i * input.stride..][..self.center.inputs()];
         known.clear();
         known.resize(graph.len(), 0);
@@ -202,15 +205,21 @@ impl Block {
         // The points of the highest bounds first, then those of high ones: they leave few others.
         for stage in [Stage::Highest, Stage::High, Stage::All] {
             kernel::above(upper, &std::array::from_fn(|l| stage.bar(bars[l], most[l])), hits);
-            for &Hit { point, mut channels } in hits.iter() {
+            // Inner products that do not wait for each other.
+            exact.clear();
+            for (at, &Hit { point, channels }) in hits.iter().enumerate() {
+                if let Some(later) = hits.get(at + 2) {
+                    let features = features(later.point as usize);
+                    prefetch(features.as_ptr(), features.len());
+                }
+                let features = features(point as usize);
+                let center = |l: usize| dot(self.center.row(l), features) + self.center.shift[l];
+                exact.extend(places(channels).map(center));
+            }
+            let mut exact = exact.iter();
+            for &Hit { point, channels } in hits.iter() {
                 let i = point as usize;
-                while channels != 0 {
-                    let l = channels.trailing_zeros() as usize;
-                    channels &= channels - 1;
-                    if upper[i][l] <= bars[l] {
-                        continue;
-                    }
-                    let center = dot(self.center.row(l), features(i)) + self.center.shift[l];
+                for (l, center) in places(channels).zip(&mut exact) {
                     let with = |neighbor: i16| center + f32::from(neighbor) * units[l];
                     if with(upper[i][l] - centers[i][l]) <= best[l] {
                         continue;

@@ -1,17 +1,20 @@
 //! Neighbour graphs of the clouds that networks see: small, and searched as a whole.
 
-use multiversion::multiversion;
+use multiversion::{multiversion, target::match_target};
 
 use super::Graph;
 use super::aligned::Aligned;
-use super::kernel::{self, BLOCK, Lanes, whole_tiles};
+use super::kernel::{self, BLOCK, Lanes, places, whole_tiles};
 use super::layer::Features;
-use crate::neighbors::Neighbor;
+#[cfg(target_arch = "x86_64")]
+use super::simd;
 
 /// Points a leaf.
 const LEAF: usize = 16;
 /// Leaves whose boxes are looked at together.
 const GROUP: usize = 16;
+/// Guesses at a radius before it is halved.
+const GUESSES: u32 = 8;
 
 /// A point and its index.
 type Entry = ([f32; 3], u32);
@@ -22,8 +25,9 @@ pub(super) struct SearchRoom {
     entries: Vec<Entry>,
     leaves: Vec<Leaf>,
     boxes: Vec<Boxes>,
-    hits: Vec<u32>,
-    found: Vec<Neighbor>,
+    /// Leaves near a point, and the squared distances of their points.
+    near: Vec<u32>,
+    distances_sq: Vec<[f32; LEAF]>,
     /// Of a block of features the columns, of all features their inner products with those and their squared lengths.
     panel: Aligned<Lanes>,
     inner: Aligned<Lanes>,
@@ -83,7 +87,6 @@ pub(super) fn nearest(
     }
     graph.k = k.min(points.len());
     graph.neighbors.clear();
-    room.hits.resize(room.leaves.len().next_multiple_of(GROUP) + GROUP, 0);
     fill(points, order, graph, room);
 }
 
@@ -109,9 +112,16 @@ fn sort(entries: &mut [Entry]) {
 }
 
 /// Fills the rows of the graph.
-#[multiversion(targets("x86_64+avx512f+avx512vl", "x86_64+avx2"))]
+#[multiversion(targets("x86_64+avx512f+avx512vl+popcnt+bmi1", "x86_64+avx2+popcnt+bmi1"))]
 fn fill(points: &[[f32; 3]], order: &[u32], graph: &mut Graph, room: &mut SearchRoom) {
-    let SearchRoom { leaves, boxes, hits, found, .. } = room;
+    let at_most = |values: &[f32; 16], most: f32| -> u32 {
+        match_target! {
+            "x86_64+avx512f" => simd::at_most_avx512(values, most),
+            "x86_64+avx2" => simd::at_most_avx2(values, most),
+            _ => kernel::at_most(values, most),
+        }
+    };
+    let SearchRoom { leaves, boxes, near, distances_sq, .. } = room;
     let k = graph.k;
     let mut last: Option<([f32; 3], f32)> = None;
     for (i, &query) in points.iter().enumerate() {
@@ -122,46 +132,55 @@ fn fill(points: &[[f32; 3]], order: &[u32], graph: &mut Graph, room: &mut Search
             let reach = r_sq.sqrt() + (between.iter().map(|d| d * d).sum::<f32>()).sqrt();
             (reach * reach * (1.0 + 1e-5) + f32::MIN_POSITIVE).min(f32::MAX)
         });
-        let mut near = 0;
-        for (g, group) in boxes.iter().enumerate() {
-            let distances_sq = group.distances_sq(query);
-            for b in 0..GROUP {
-                hits[near] = (g * GROUP + b) as u32;
-                near += usize::from(distances_sq[b] <= bound);
-            }
+        near.clear();
+        for (start, group) in (0..).step_by(GROUP).zip(boxes.iter()) {
+            near.extend(places(at_most(&group.distances_sq(query), bound)).map(|leaf| start + leaf as u32));
         }
-        found.resize(found.len().max(near * LEAF + LEAF), Neighbor { index: 0, distance_sq: 0.0 });
-        let mut count = 0;
-        for &leaf in &hits[..near] {
-            let distances_sq = leaves[leaf as usize].distances_sq(query);
-            let slots = &mut found[count..count + LEAF];
-            let mut within = 0;
-            for l in 0..LEAF {
-                // `within` is at most `l`: the remainder changes nothing and spares the bounds check.
-                slots[within % LEAF] =
-                    Neighbor { index: leaf * LEAF as u32 + l as u32, distance_sq: distances_sq[l] };
-                within += usize::from(distances_sq[l] <= bound);
-            }
-            count += within;
+        distances_sq.clear();
+        distances_sq.extend(near.iter().map(|&leaf| leaves[leaf as usize].distances_sq(query)));
+        let count = |most: f32| distances_sq.iter().map(|d| at_most(d, most).count_ones() as usize).sum();
+        let radius_sq = radius_sq(count, k, bound);
+        for (&leaf, distances_sq) in near.iter().zip(distances_sq.iter()) {
+            let within = places(at_most(distances_sq, radius_sq));
+            graph.neighbors.extend(within.map(|place| leaf * LEAF as u32 + place as u32));
         }
-        let reach = choose(&mut found[..count], k, order, &mut graph.neighbors);
+        let row = &mut graph.neighbors[i * k..];
+        if row.len() > k {
+            // Some are as far as the k-th.
+            row.select_nth_unstable_by_key(k - 1, |&j| {
+                let between = [0, 1, 2].map(|a| points[j as usize][a] - query[a]);
+                (between.iter().map(|d| d * d).sum::<f32>().to_bits(), order[j as usize])
+            });
+        }
+        last = (row.len() >= k).then_some((query, radius_sq));
         // Distances that overflow leave a row short.
         graph.neighbors.resize((i + 1) * k, i as u32);
-        last = (count >= k).then_some((query, reach));
     }
 }
 
-/// Appends the `k` nearest of `found` to `row`; returns the squared distance of the farthest of them.
+/// A radius within which `count` finds `k`, more only where several are as far as the last; `bound` where there are
+/// fewer within that.
 #[inline(always)]
-fn choose(found: &mut [Neighbor], k: usize, order: &[u32], row: &mut Vec<u32>) -> f32 {
-    let rank = |n: &Neighbor| u64::from(n.distance_sq.to_bits()) << 32 | u64::from(order[n.index as usize]);
-    let k = k.min(found.len());
-    if k == 0 {
-        return 0.0;
+fn radius_sq(count: impl Fn(f32) -> usize, k: usize, bound: f32) -> f32 {
+    // Numbers grow as their bits do. Below `low` there are too few, up to `high` enough.
+    let (mut low, mut low_count) = (0, 0);
+    let (mut high, mut high_count) = (bound.to_bits(), count(bound));
+    let mut step = 0;
+    while high_count > k && low < high {
+        // Points on a surface are about as many as their squared distance is large.
+        let share = (k as f32 + 0.5 - low_count as f32) / (high_count - low_count) as f32;
+        let (from, to) = (f32::from_bits(low), f32::from_bits(high));
+        let middle = if step < GUESSES { (from + share * (to - from)).to_bits() } else { low.midpoint(high) };
+        let middle = middle.clamp(low, high - 1);
+        let found = count(f32::from_bits(middle));
+        if found < k {
+            (low, low_count) = (middle + 1, found);
+        } else {
+            (high, high_count) = (middle, found);
+        }
+        step += 1;
     }
-    found.select_nth_unstable_by_key(k - 1, rank);
-    row.extend(found[..k].iter().map(|n| n.index));
-    found[k - 1].distance_sq
+    f32::from_bits(high)
 }
 
 impl Boxes {

@@ -221,6 +221,28 @@ pub(super) fn above_avx2(bounds: &[Bounds], bar: &Bounds, hits: &mut Vec<Hit>) {
     }
 }
 
+/// [`at_most`](super::kernel::at_most) in a vector of 16.
+#[inline]
+#[target_feature(enable = "avx512f")]
+pub(super) fn at_most_avx512(values: &[f32; 16], most: f32) -> u32 {
+    // SAFETY: reads 16 values.
+    let values = unsafe { _mm512_loadu_ps(values.as_ptr()) };
+    _mm512_cmp_ps_mask::<_CMP_LE_OQ>(values, _mm512_set1_ps(most)).into()
+}
+
+/// [`at_most`](super::kernel::at_most) in vectors of 8.
+#[inline]
+#[target_feature(enable = "avx2")]
+pub(super) fn at_most_avx2(values: &[f32; 16], most: f32) -> u32 {
+    let most = _mm256_set1_ps(most);
+    let [low, high] = [0, 8].map(|at| {
+        // SAFETY: reads half of the 16 values.
+        let values = unsafe { _mm256_loadu_ps(values[at..].as_ptr()) };
+        _mm256_movemask_ps(_mm256_cmp_ps::<_CMP_LE_OQ>(values, most)).cast_unsigned()
+    });
+    low | high << 8
+}
+
 /// The columns of a tile of rows.
 #[inline(always)]
 fn columns<T: Copy>(rows: &[T], stride: usize) -> impl Iterator<Item = [T; TILE]> {
