@@ -26,7 +26,8 @@ const FINE_CANDIDATES: usize = 3;
 const PROMISING: f64 = 0.7;
 /// Where points lie on each other as closely as this, no other pose can look as right.
 const COINCIDENT: f64 = 0.95;
-/// Points that score a raw hypothesis, that refine it coarsely, that score it then, and that score the result.
+/// Points that score an alternative, a raw hypothesis, that refine it coarsely, that score it then, and that score the result.
+const GLANCING_POINTS: usize = 96;
 const RANKING_POINTS: usize = 192;
 const COARSE_POINTS: usize = 300;
 const COMPARING_POINTS: usize = 500;
@@ -195,9 +196,9 @@ impl<'a> Pipeline<'a> {
         let (source, target) = (self.source.coarse(), self.target.coarse());
         let limit = REACH_VOXELS * source.voxel_size.max(target.voxel_size);
         let rank = |pose: &Rigid, points: usize| overlap_at(source, target, pose, points, limit).score(2);
-        let promising = |hypotheses: &[Hypothesis], least: f64| {
+        let promising = |hypotheses: &[Hypothesis], points: usize, least: f64| {
             let mut ranked: Vec<(f64, Hypothesis)> =
-                hypotheses.par_iter().map(|h| (rank(&h.pose, RANKING_POINTS), *h)).collect();
+                hypotheses.par_iter().map(|h| (rank(&h.pose, points), *h)).collect();
             ranked.retain(|&(score, _)| score >= least);
             keep_promising(&mut ranked, COARSE_CANDIDATES);
             ranked
@@ -214,12 +215,12 @@ impl<'a> Pipeline<'a> {
             });
             refined.collect()
         };
-        let mut ranked = coarsely_refined(promising(hypotheses, 0.0));
+        let mut ranked = coarsely_refined(promising(hypotheses, RANKING_POINTS, 0.0));
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         if let Some((score, best)) = ranked.first()
             && *score < COINCIDENT
         {
-            let others = promising(&alternatives(&best.pose), PROMISING * score);
+            let others = promising(&alternatives(&best.pose), GLANCING_POINTS, PROMISING * score);
             ranked.extend(coarsely_refined(others));
             ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         }

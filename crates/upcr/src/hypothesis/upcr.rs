@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
 
-use super::{Hypothesis, HypothesisSource, Problem, drop_repeats};
+use super::{Hypothesis, HypothesisSource, Problem};
 use crate::{net::Network, prepare::Level, settings::Method, transform::Rigid, verify::overlap_at};
 
 /// Points that the network learned from, and that it sees here at most: its pose is only a first one.
@@ -13,12 +13,14 @@ const PASSES: usize = 4;
 /// Points that tell how close the clouds are, and the share of the larger cloud's radius that counts as far.
 const JUDGED_POINTS: usize = 192;
 const FAR: f32 = 0.2;
-/// Score from which on the refinement needs no closer pose, and below which other sources are the better choice: right
-/// poses of overlapping shapes have 0.7 and more, wrong ones of scenes less.
+/// Score from which on the refinement needs no closer pose.
 const CLOSE: f64 = 0.9;
-const HOPELESS: f64 = 0.7;
-/// Turns about a principal axis, in degrees, that lay nearly symmetric shapes on themselves.
-const TURNS_DEG: [f64; 5] = [90.0, 120.0, 180.0, 240.0, 270.0];
+/// Scores below which other sources are the better choice, after the first pass and after the last: right poses of
+/// shapes that overlap well have more, wrong ones of scenes less.
+const FAR_OFF: f64 = 0.6;
+const HOPELESS: f64 = 0.8;
+/// Turns about each principal axis that stand beside the network's pose.
+const TURNS: u32 = 12;
 
 pub(super) struct Upcr;
 
@@ -71,7 +73,7 @@ impl HypothesisSource for Upcr {
         let closeness = |pose: &Rigid| overlap_at(source, target, pose, JUDGED_POINTS, FAR * radius).score(2);
 
         let (mut pose, mut closest) = (problem.init, 0.0);
-        let mut hypotheses: Vec<Hypothesis> = Vec::new();
+        let mut passes = 0;
         let (mut found, canonical_target) = rayon::join(|| canonical_source(&pose), canonical_target);
         let Ok(canonical_target) = canonical_target else { return Vec::new() };
         while let Ok(canonical_source_pose) = found {
@@ -81,18 +83,16 @@ impl HypothesisSource for Upcr {
             if closer <= closest {
                 break;
             }
-            (pose, closest) = (next, closer);
-            hypotheses.insert(0, Hypothesis { pose, method: Method::Upcr, support: 0 });
-            if closest >= CLOSE || hypotheses.len() == PASSES {
+            (pose, closest, passes) = (next, closer, passes + 1);
+            if closest >= CLOSE || passes == PASSES || (closest < FAR_OFF && !problem.alone) {
                 break;
             }
             found = canonical_source(&pose);
         }
-        if closest < HOPELESS && !problem.alone {
+        if passes == 0 || (closest < HOPELESS && !problem.alone) {
             return Vec::new();
         }
-        drop_repeats(&mut hypotheses, problem);
-        hypotheses
+        vec![Hypothesis { pose, method: Method::Upcr, support: 0 }]
     }
 
     /// The network has one answer: whether a nearly symmetric shape has a better one, or another as good, only a
@@ -118,8 +118,9 @@ fn turns(points: &[[f32; 3]]) -> impl Iterator<Item = Rigid> {
     let axes = covariance.symmetric_eigen().eigenvectors;
     (0..3).flat_map(move |axis| {
         let axis = Unit::new_normalize(axes.column(axis).into_owned());
-        TURNS_DEG.iter().map(move |angle| {
-            let rotation = Rotation3::from_axis_angle(&axis, angle.to_radians()).into_inner();
+        (1..TURNS).map(move |step| {
+            let angle = std::f64::consts::TAU * f64::from(step) / f64::from(TURNS);
+            let rotation = Rotation3::from_axis_angle(&axis, angle).into_inner();
             Rigid { rotation, translation: mean - rotation * mean }
         })
     })
