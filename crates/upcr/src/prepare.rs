@@ -49,7 +49,7 @@ pub(crate) enum Described {
 
 /// A cloud that passed the checks, with the numbers that later steps need.
 pub(crate) struct Checked<'a> {
-    cloud: &'a PointCloud,
+    pub cloud: &'a PointCloud,
     pub bounds: Bounds,
     role: CloudRole,
 }

@@ -9,7 +9,7 @@ use crate::{
     CloudRole, Error, PointCloud, Result,
     cloud::orient_by_curvature,
     features::{Descriptors, Feature, FeatureInput, Fpfh},
-    hypothesis::{Hypothesis, Match, Problem, SOURCES, match_levels, separation},
+    hypothesis::{Hypothesis, Match, Problem, SOURCES, are_alike, match_levels, separation},
     prepare::{Described, Level, Prepared, check, derive_voxel_size, prepare},
     refine::{Icp, LockedPose, Refined, Refinement, Schedule, factor},
     registration::{Registration, Timings},
@@ -66,16 +66,19 @@ fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<
         rayon::join(|| check(source, CloudRole::Source), || check(target, CloudRole::Target));
     let (source, target) = (source?, target?);
     let voxel_size = settings.voxel_size.unwrap_or_else(|| derive_voxel_size(&source, &target));
+    let asks_network = match settings.method {
+        Method::Auto => are_alike(source.cloud, target.cloud),
+        method => method == Method::Upcr,
+    };
     let described = match settings.method {
         Method::Prior => Described::Never,
-        // The network, or a first guess, is asked before.
-        Method::Auto | Method::Upcr => Described::Perhaps,
-        Method::Features | Method::Consensus | Method::Fgr | Method::Ransac => Described::Surely,
+        _ if asks_network => Described::Perhaps,
+        _ => Described::Surely,
     };
     let (source, target) =
         rayon::join(|| prepare(&source, voxel_size, described), || prepare(&target, voxel_size, described));
     let (source, target) = (source?, target?);
-    let mut pipeline = Pipeline::new(&source, &target, voxel_size, settings);
+    let mut pipeline = Pipeline::new(&source, &target, voxel_size, asks_network, settings);
     pipeline.timings.prepare = milliseconds(start);
     let mut best = pipeline.best()?;
     best.timings_ms.total = milliseconds(start);
@@ -92,6 +95,7 @@ struct Pipeline<'a> {
     target: &'a Prepared,
     settings: &'a Settings,
     voxel_size: f64,
+    asks_network: bool,
     init: Rigid,
     lock: Option<LockedPose>,
     matches: Vec<Match>,
@@ -100,7 +104,13 @@ struct Pipeline<'a> {
 }
 
 impl<'a> Pipeline<'a> {
-    fn new(source: &'a Prepared, target: &'a Prepared, voxel_size: f64, settings: &'a Settings) -> Self {
+    fn new(
+        source: &'a Prepared,
+        target: &'a Prepared,
+        voxel_size: f64,
+        asks_network: bool,
+        settings: &'a Settings,
+    ) -> Self {
         let init = settings.init.unwrap_or_else(Rigid::identity);
         let lock = LockedPose::new(settings.locks, &init, source.origin, target.origin);
         let init = to_local(&init, source, target);
@@ -109,6 +119,7 @@ impl<'a> Pipeline<'a> {
             target,
             settings,
             voxel_size,
+            asks_network,
             init,
             lock,
             matches: Vec::new(),
@@ -163,7 +174,11 @@ impl<'a> Pipeline<'a> {
 
     fn wants(&self, method: Method) -> bool {
         match self.settings.method {
-            Method::Auto => method != Method::Prior || self.settings.init.is_some(),
+            Method::Auto => match method {
+                Method::Prior => self.settings.init.is_some(),
+                Method::Upcr => self.asks_network,
+                _ => true,
+            },
             Method::Features => matches!(method, Method::Consensus | Method::Fgr | Method::Ransac),
             chosen => chosen == method,
         }

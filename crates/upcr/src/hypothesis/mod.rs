@@ -9,6 +9,7 @@ mod upcr;
 
 use matching::are_congruent;
 pub(crate) use matching::{Match, match_levels};
+pub(crate) use upcr::are_alike;
 
 use crate::{net::Network, prepare::Prepared, settings::Method, transform::Rigid};
 

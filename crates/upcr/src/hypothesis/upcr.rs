@@ -1,9 +1,11 @@
 //! The UPCR network's pose, once and again on the moved source while the clouds come closer.
 
-use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
+use nalgebra::{Matrix3, Rotation3, SymmetricEigen, U3, Unit, Vector3};
 
 use super::{Hypothesis, HypothesisSource, Problem};
-use crate::{net::Network, prepare::Level, settings::Method, transform::Rigid, verify::overlap_at};
+use crate::{
+    PointCloud, net::Network, prepare::Level, settings::Method, transform::Rigid, verify::overlap_at,
+};
 
 /// Points that the network learned from, and that it sees here at most: its pose is only a first one.
 const LEARNED_POINTS: usize = 1024;
@@ -19,10 +21,47 @@ const CLOSE: f64 = 0.9;
 /// shapes that overlap well have more, wrong ones of scenes less.
 const FAR_OFF: f64 = 0.6;
 const HOPELESS: f64 = 0.8;
+/// Points that tell how a cloud is spread, and how little the spreads of two views of one whole differ, as a share of
+/// the largest: noise changes less, a crop mostly more.
+const SPREAD_POINTS: usize = 4096;
+const ALIKE: f64 = 0.03;
 /// Turns about each principal axis that stand beside the network's pose.
 const TURNS: u32 = 12;
 
 pub(super) struct Upcr;
+
+/// Whether two clouds may show the same whole, which the network pools over: their spreads along their own principal
+/// axes, which no motion changes, are nearly equal.
+pub(crate) fn are_alike(source: &PointCloud, target: &PointCloud) -> bool {
+    let (a, b) = (deviations(source), deviations(target));
+    (a - b).amax() <= ALIKE * a.amax().max(b.amax())
+}
+
+/// Standard deviations along the principal axes, largest first.
+fn deviations(cloud: &PointCloud) -> Vector3<f64> {
+    let step = cloud.len().div_ceil(SPREAD_POINTS).max(1);
+    let mut deviations = principal_axes(cloud.points.iter().step_by(step).copied()).eigenvalues;
+    deviations.as_mut_slice().sort_by(|a, b| b.total_cmp(a));
+    deviations.map(|variance| variance.max(0.0).sqrt())
+}
+
+/// Eigenvectors and eigenvalues of the covariance.
+fn principal_axes(points: impl ExactSizeIterator<Item = [f64; 3]> + Clone) -> SymmetricEigen<f64, U3> {
+    let weight = 1.0 / points.len().max(1) as f64;
+    let mean = mean(points.clone());
+    let covariance: Matrix3<f64> = points
+        .map(|p| {
+            let d = Vector3::from(p) - mean;
+            d * d.transpose() * weight
+        })
+        .sum();
+    covariance.symmetric_eigen()
+}
+
+fn mean(points: impl ExactSizeIterator<Item = [f64; 3]>) -> Vector3<f64> {
+    let weight = 1.0 / points.len().max(1) as f64;
+    points.map(|p| Vector3::from(p) * weight).sum()
+}
 
 impl HypothesisSource for Upcr {
     fn method(&self) -> Method {
@@ -106,16 +145,8 @@ impl HypothesisSource for Upcr {
 
 /// Turns of the points about their principal axes.
 fn turns(points: &[[f32; 3]]) -> impl Iterator<Item = Rigid> {
-    let weight = 1.0 / points.len().max(1) as f64;
-    let mean = points.iter().map(|p| Vector3::from(p.map(f64::from)) * weight).sum::<Vector3<f64>>();
-    let covariance: Matrix3<f64> = points
-        .iter()
-        .map(|p| {
-            let d = Vector3::from(p.map(f64::from)) - mean;
-            d * d.transpose() * weight
-        })
-        .sum();
-    let axes = covariance.symmetric_eigen().eigenvectors;
+    let points = points.iter().map(|p| p.map(f64::from));
+    let (mean, axes) = (mean(points.clone()), principal_axes(points).eigenvectors);
     (0..3).flat_map(move |axis| {
         let axis = Unit::new_normalize(axes.column(axis).into_owned());
         (1..TURNS).map(move |step| {
@@ -134,4 +165,22 @@ fn sample(level: &Level) -> Vec<[f32; 3]> {
 fn spread(points: &[[f32; 3]]) -> f32 {
     let mean = points.iter().map(|&p| Vector3::from(p)).sum::<Vector3<f32>>() / points.len().max(1) as f32;
     points.iter().map(|&p| (Vector3::from(p) - mean).norm()).fold(0.0, f32::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_moved_cloud_is_alike_and_a_part_is_not() {
+        let point = |i: usize| [(i % 7) as f64, 2.0 * (i % 11) as f64, 3.0 * (i % 13) as f64];
+        let cloud = PointCloud::from_points((0..1001).map(point).collect());
+        let motion = Rigid {
+            rotation: Rotation3::from_euler_angles(0.4, -1.0, 2.5).into_inner(),
+            translation: Vector3::new(4e5, -2e6, 70.0),
+        };
+        assert!(are_alike(&cloud, &cloud.transformed(&motion)));
+        let part = cloud.points.iter().copied().filter(|p| p[2] < 26.0).collect();
+        assert!(!are_alike(&cloud, &PointCloud::from_points(part)));
+    }
 }
