@@ -26,7 +26,8 @@ const FINE_CANDIDATES: usize = 3;
 const PROMISING: f64 = 0.7;
 /// Where points lie on each other as closely as this, no other pose can look as right.
 const COINCIDENT: f64 = 0.95;
-/// Points that score an alternative, a raw hypothesis, that refine it coarsely, that score it then, and that score the result.
+/// Points that score an alternative at a glance and a raw hypothesis, that refine it coarsely, that score it then, and
+/// that score the result.
 const GLANCING_POINTS: usize = 96;
 const RANKING_POINTS: usize = 192;
 const COARSE_POINTS: usize = 300;
