@@ -5,6 +5,7 @@ use std::path::Path;
 use anyhow::Result;
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
+#[cfg(feature = "train")]
 use upcr_lab::data::pairs::Protocol;
 use upcr_lab::data::{self, Half, Shapes, Split};
 
