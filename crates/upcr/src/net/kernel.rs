@@ -6,6 +6,7 @@ use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
 use multiversion::{multiversion, target::target_cfg_f};
 
 use super::Graph;
+use super::graph::PairedRows;
 #[cfg(target_arch = "x86_64")]
 use super::simd;
 
@@ -173,19 +174,24 @@ fn multiply_quads_portable(rows: &[Quad], stride: usize, panel: &[QuadLanes], ou
 pub(super) fn gather(
     center: &[Lanes],
     neighbor: &[Lanes],
-    graph: &Graph,
+    rows: &PairedRows,
     slope: f32,
     out: &mut [f32],
     stride: usize,
 ) {
-    let out = out.chunks_mut(stride).filter_map(<[f32]>::first_chunk_mut::<BLOCK>);
-    for ((row, center), out) in graph.rows().zip(center).zip(out) {
-        prefetch(out.as_ptr().wrapping_add(AHEAD * stride), BLOCK);
-        let mut values = largest(neighbor, row);
-        for l in 0..BLOCK {
-            values[l] = leaky(center[l] + values[l], slope);
+    let mut out = out.chunks_mut(stride).filter_map(<[f32]>::first_chunk_mut::<BLOCK>);
+    for ([both, first, second], center) in rows.pairs().zip(center.chunks_exact(2)) {
+        let shared = largest([f32::NEG_INFINITY; BLOCK], neighbor, both);
+        for (center, alone) in center.iter().zip([first, second]) {
+            // Whole tiles have a row beyond the last of an odd number of points.
+            let Some(out) = out.next() else { break };
+            prefetch(out.as_ptr().wrapping_add(AHEAD * stride), BLOCK);
+            let mut values = largest(shared, neighbor, alone);
+            for l in 0..BLOCK {
+                values[l] = leaky(center[l] + values[l], slope);
+            }
+            *out = values;
         }
-        *out = values;
     }
 }
 
@@ -199,10 +205,9 @@ pub(super) fn prefetch(values: *const f32, len: usize) {
     }
 }
 
-/// The channels' largest values over the points in `row`.
+/// The channels' largest values of `most` and over the points in `row`.
 #[inline(always)]
-fn largest(values: &[Lanes], row: &[u32]) -> Lanes {
-    let mut most = [f32::NEG_INFINITY; BLOCK];
+fn largest(mut most: Lanes, values: &[Lanes], row: &[u32]) -> Lanes {
     for &j in row {
         let values = &values[j as usize];
         for l in 0..BLOCK {

@@ -5,6 +5,7 @@
 //! neighbours can be taken before them; a negative scale is folded into the weights first.
 
 use super::aligned::Aligned;
+use super::graph::PairedRows;
 use super::kernel::{self, BLOCK, Lanes, whole_tiles};
 use super::weights::Affine;
 use super::{Graph, InvariantInputs};
@@ -79,12 +80,19 @@ impl GraphLayer {
     }
 
     /// The layer's features from those of the layer before it.
-    pub fn apply(&self, input: &Features, graph: &Graph, products: &mut Products, output: &mut Features) {
-        output.reserve(graph.len(), self.blocks.len() * BLOCK);
+    pub fn apply(
+        &self,
+        input: &Features,
+        points: usize,
+        rows: &PairedRows,
+        products: &mut Products,
+        output: &mut Features,
+    ) {
+        output.reserve(points, self.blocks.len() * BLOCK);
         for (b, block) in self.blocks.iter().enumerate() {
-            block.multiply(input, graph.len(), products);
+            block.multiply(input, points, products);
             let (out, stride) = (&mut output.values[b * BLOCK..], output.stride);
-            kernel::gather(&products.center, &products.neighbor, graph, self.slope, out, stride);
+            kernel::gather(&products.center, &products.neighbor, rows, self.slope, out, stride);
         }
     }
 }

@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use nalgebra::Vector3;
 
+use super::graph::PairedRows;
 use super::head::Head;
 use super::layer::{Embedding, Features, GraphLayer, Products};
 use super::pool::{PoolRoom, PooledLayer};
@@ -201,19 +202,19 @@ impl Network {
     fn run(&self, cloud: &[[f32; 3]], role: CloudRole, k: usize, room: &mut Room) -> Result<()> {
         check(cloud, role)?;
         self.prepare(cloud, k, room)?;
-        let Room { representations, points, order, graph, inputs, global, invariant, values, .. } = room;
+        let Room { representations, points, order, neighbors, inputs, global, invariant, values, .. } = room;
         let (global_gamma, invariant_gamma) = (&mut representations.global, &mut representations.invariant);
         rayon::join(
             || {
                 global.features.copy_from(points.as_flattened(), 3);
-                self.branch(&self.global, 3, graph, order, global, global_gamma);
+                self.branch(&self.global, 3, neighbors, order, global, global_gamma);
             },
             || {
                 if let Some(InvariantBranch { embedding, branch }) = &self.invariant {
                     let BranchRoom { features, next, products, .. } = invariant;
-                    embedding.apply(inputs, graph, next, products, features);
+                    embedding.apply(inputs, &neighbors.graph, next, products, features);
                     let channels = self.config.widths[0];
-                    self.branch(branch, channels, graph, order, invariant, invariant_gamma);
+                    self.branch(branch, channels, neighbors, order, invariant, invariant_gamma);
                 }
             },
         );
@@ -224,7 +225,8 @@ impl Network {
 
     /// Moves the cloud to its centroid and finds neighbours and φ.
     fn prepare(&self, cloud: &[[f32; 3]], k: usize, room: &mut Room) -> Result<()> {
-        let Room { representations, points, order, graph, inputs, search, .. } = room;
+        let Room { representations, points, order, neighbors, inputs, search, .. } = room;
+        let Neighbors { graph, rows } = neighbors;
         let o = centroid(cloud);
         representations.centroid = o;
         points.clear();
@@ -243,6 +245,7 @@ impl Network {
                 order.extend(0..points.len() as u32);
             }
         }
+        rows.fill(graph);
         Ok(())
     }
 
@@ -251,36 +254,37 @@ impl Network {
         &self,
         branch: &Branch,
         mut channels: usize,
-        graph: &Graph,
+        neighbors: &Neighbors,
         order: &[u32],
         room: &mut BranchRoom,
         gamma: &mut Vec<f32>,
     ) {
-        let BranchRoom { features, next, products, pool, graph: own, search } = room;
+        let BranchRoom { features, next, products, pool, own, search } = room;
         for (layer, &outputs) in branch.layers.iter().zip(&self.config.widths) {
-            let graph = self.neighbors(features, channels, graph, order, own, search);
-            layer.apply(features, graph, products, next);
+            let Neighbors { graph, rows } = self.neighbors(features, channels, neighbors, order, own, search);
+            layer.apply(features, graph.len(), rows, products, next);
             std::mem::swap(features, next);
             channels = outputs;
         }
-        let graph = self.neighbors(features, channels, graph, order, own, search);
-        branch.last.apply(features, graph, pool, gamma);
+        let Neighbors { graph, rows } = self.neighbors(features, channels, neighbors, order, own, search);
+        branch.last.apply(features, graph, rows, pool, gamma);
     }
 
-    /// The graph of a layer: `graph`, or `own`, filled with that of the layer's features.
+    /// The neighbours of a layer: `by_position`, or `own`, filled with those by the layer's features.
     fn neighbors<'a>(
         &self,
         features: &Features,
         channels: usize,
-        graph: &'a Graph,
+        by_position: &'a Neighbors,
         order: &[u32],
-        own: &'a mut Graph,
+        own: &'a mut Neighbors,
         search: &mut SearchRoom,
-    ) -> &'a Graph {
+    ) -> &'a Neighbors {
         match self.config.graph {
-            GraphKind::Static => graph,
+            GraphKind::Static => by_position,
             GraphKind::Dynamic => {
-                nearest_features(features, channels, graph.k, order, own, search);
+                nearest_features(features, channels, by_position.graph.k, order, &mut own.graph, search);
+                own.rows.fill(&own.graph);
                 own
             }
         }
@@ -348,13 +352,20 @@ struct Room {
     /// Points about the centroid, near ones near each other, and the order that they came in.
     points: Vec<[f32; 3]>,
     order: Vec<u32>,
-    graph: Graph,
+    neighbors: Neighbors,
     search: SearchRoom,
     inputs: InvariantInputs,
     global: BranchRoom,
     invariant: BranchRoom,
     representations: Representations,
     values: Vec<f32>,
+}
+
+/// A graph, and its rows as layers look at them.
+#[derive(Debug, Default)]
+struct Neighbors {
+    graph: Graph,
+    rows: PairedRows,
 }
 
 /// What a branch needs room for.
@@ -364,7 +375,7 @@ struct BranchRoom {
     next: Features,
     products: Products,
     pool: PoolRoom,
-    graph: Graph,
+    own: Neighbors,
     search: SearchRoom,
 }
 

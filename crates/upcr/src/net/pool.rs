@@ -10,6 +10,7 @@ use multiversion::multiversion;
 
 use super::Graph;
 use super::aligned::Aligned;
+use super::graph::PairedRows;
 use super::kernel::{
     self, BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE, dot, larger, leaky, places, prefetch,
     whole_tiles,
@@ -74,11 +75,22 @@ pub(super) struct PoolRoom {
     neighbor: Aligned<Bounds>,
     upper: Aligned<Bounds>,
     hits: Vec<Hit>,
-    /// The center's values at the hits.
-    exact: Vec<f32>,
+    candidates: Vec<Candidate>,
     /// The neighbour's products, where a point's bits say that they are known.
     products: Vec<Lanes>,
     known: Vec<u32>,
+}
+
+/// A point and a channel of it that may have the largest value.
+#[derive(Debug, Clone, Copy)]
+struct Candidate {
+    point: usize,
+    channel: usize,
+    /// The center's value.
+    center: f32,
+    /// The highest bound of a neighbour's product, and the neighbour that has it.
+    highest: i16,
+    first: usize,
 }
 
 /// Features as bytes about the means of their groups.
@@ -133,9 +145,16 @@ impl PooledLayer {
     }
 
     /// The maximum over all points of the layer's features.
-    pub fn apply(&self, input: &Features, graph: &Graph, room: &mut PoolRoom, gamma: &mut Vec<f32>) {
+    pub fn apply(
+        &self,
+        input: &Features,
+        graph: &Graph,
+        rows: &PairedRows,
+        room: &mut PoolRoom,
+        gamma: &mut Vec<f32>,
+    ) {
         let reach = quantize(input, self.inputs, graph.len(), &mut room.features);
-        self.apply_within(reach, input, graph, room, gamma);
+        self.apply_within(reach, input, graph, rows, room, gamma);
     }
 
     /// [`Self::apply`] to quantized features; where they are [`UNBOUNDED`], every value is computed.
@@ -144,6 +163,7 @@ impl PooledLayer {
         reach: Reach,
         input: &Features,
         graph: &Graph,
+        rows: &PairedRows,
         room: &mut PoolRoom,
         gamma: &mut Vec<f32>,
     ) {
@@ -156,7 +176,7 @@ impl PooledLayer {
         gamma.clear();
         for block in &self.blocks {
             let units = block.bound(reach, room);
-            let most = gather(&room.center, &room.neighbor, graph, &mut room.upper);
+            let most = gather(&room.center, &room.neighbor, rows, &mut room.upper);
             let values = block.search(&units, &most, input, graph, room);
             gamma.extend(values.map(|v| leaky(v, self.slope)));
         }
@@ -196,8 +216,9 @@ impl Block {
         graph: &Graph,
         room: &mut PoolRoom,
     ) -> Lanes {
-        let PoolRoom { center: centers, neighbor, upper, hits, exact, products, known, .. } = room;
+        let PoolRoom { center: centers, neighbor, upper, hits, candidates, products, known, .. } = room;
         let features = |i: usize| &input.values[i * input.stride..][..self.center.inputs()];
+        let fetch = |i: usize| prefetch(features(i).as_ptr(), self.center.inputs());
         known.clear();
         known.resize(graph.len(), 0);
         let mut best = [f32::NEG_INFINITY; BLOCK];
@@ -205,37 +226,49 @@ impl Block {
         // The points of the highest bounds first, then those of high ones: they leave few others.
         for stage in [Stage::Highest, Stage::High, Stage::All] {
             kernel::above(upper, &std::array::from_fn(|l| stage.bar(bars[l], most[l])), hits);
-            // Inner products that do not wait for each other.
-            exact.clear();
+            // Inner products that do not wait for each other, while the features of later ones come into cache.
+            candidates.clear();
             for (at, &Hit { point, channels }) in hits.iter().enumerate() {
                 if let Some(later) = hits.get(at + 2) {
-                    let features = features(later.point as usize);
-                    prefetch(features.as_ptr(), features.len());
+                    fetch(later.point as usize);
                 }
-                let features = features(point as usize);
-                let center = |l: usize| dot(self.center.row(l), features) + self.center.shift[l];
-                exact.extend(places(channels).map(center));
-            }
-            let mut exact = exact.iter();
-            for &Hit { point, channels } in hits.iter() {
                 let i = point as usize;
-                for (l, center) in places(channels).zip(&mut exact) {
-                    let with = |neighbor: i16| center + f32::from(neighbor) * units[l];
-                    if with(upper[i][l] - centers[i][l]) <= best[l] {
-                        continue;
+                for l in places(channels) {
+                    let center = dot(self.center.row(l), features(i)) + self.center.shift[l];
+                    let highest = upper[i][l] - centers[i][l];
+                    // Later stages need not look at it again.
+                    upper[i][l] = i16::MIN;
+                    if center + f32::from(highest) * units[l] > best[l] {
+                        let row = graph.row(i);
+                        let first = row.iter().find(|&&j| neighbor[j as usize][l] == highest);
+                        let first = first.map_or(i, |&j| j as usize);
+                        fetch(first);
+                        candidates.push(Candidate { point: i, channel: l, center, highest, first });
                     }
-                    for &j in graph.row(i) {
-                        let j = j as usize;
-                        if with(neighbor[j][l]) > best[l] {
-                            if known[j] & 1 << l == 0 {
-                                known[j] |= 1 << l;
-                                products[j][l] = dot(self.neighbor.row(l), features(j));
-                            }
-                            best[l] = larger(center + products[j][l], best[l]);
-                        }
-                    }
-                    bars[l] = bar(best[l], units[l]);
                 }
+            }
+            for &Candidate { point, channel: l, center, highest, first } in candidates.iter() {
+                let mut visit = |j: usize, best: f32| {
+                    if known[j] & 1 << l == 0 {
+                        known[j] |= 1 << l;
+                        products[j][l] = dot(self.neighbor.row(l), features(j));
+                    }
+                    larger(center + products[j][l], best)
+                };
+                if center + f32::from(highest) * units[l] <= best[l] {
+                    continue;
+                }
+                let mut most = visit(first, best[l]);
+                let mut least = bar(most - center, units[l]);
+                for &j in graph.row(point) {
+                    let j = j as usize;
+                    if neighbor[j][l] > least && j != first {
+                        most = visit(j, most);
+                        least = bar(most - center, units[l]);
+                    }
+                }
+                best[l] = most;
+                bars[l] = bar(most, units[l]);
             }
         }
         best
@@ -263,7 +296,8 @@ impl Stage {
 
 /// Values whose bounds do not exceed it are not larger than `best`.
 fn bar(best: f32, unit: f32) -> i16 {
-    ((best / unit).floor() - 1.0) as i16
+    // Towards zero, which is up by less than one where it is negative.
+    ((best / unit) as i16).saturating_sub(2)
 }
 
 impl Map {
@@ -423,21 +457,28 @@ fn quantize(input: &Features, inputs: usize, points: usize, quantized: &mut Quan
 
 /// Bounds of the values at every point, and the highest of each channel.
 #[multiversion(targets("x86_64+avx512f+avx512vl+avx512bw", "x86_64+avx2"))]
-fn gather(center: &[Bounds], neighbor: &[Bounds], graph: &Graph, upper: &mut [Bounds]) -> Bounds {
-    let mut highest = [i16::MIN; BLOCK];
-    for ((row, center), upper) in graph.rows().zip(center).zip(upper) {
-        let mut most = [i16::MIN; BLOCK];
+fn gather(center: &[Bounds], neighbor: &[Bounds], rows: &PairedRows, upper: &mut [Bounds]) -> Bounds {
+    let larger_of = |mut most: Bounds, row: &[u32]| {
         for &j in row {
             let bounds = &neighbor[j as usize];
             for l in 0..BLOCK {
                 most[l] = most[l].max(bounds[l]);
             }
         }
-        for l in 0..BLOCK {
-            most[l] += center[l];
-            highest[l] = highest[l].max(most[l]);
+        most
+    };
+    let mut highest = [i16::MIN; BLOCK];
+    let pairs = rows.pairs().zip(center.chunks(2)).zip(upper.chunks_mut(2));
+    for (([both, first, second], center), upper) in pairs {
+        let shared = larger_of([i16::MIN; BLOCK], both);
+        for ((center, upper), alone) in center.iter().zip(upper).zip([first, second]) {
+            let mut most = larger_of(shared, alone);
+            for l in 0..BLOCK {
+                most[l] += center[l];
+                highest[l] = highest[l].max(most[l]);
+            }
+            *upper = most;
         }
-        *upper = most;
     }
     highest
 }
@@ -486,7 +527,9 @@ mod tests {
             let Self { layer, features, graph } = self;
             let found = quantize(features, layer.inputs, graph.len(), &mut room.features);
             let reach = reach.unwrap_or(found);
-            layer.apply_within(reach, features, graph, &mut room, &mut gamma);
+            let mut rows = PairedRows::default();
+            rows.fill(graph);
+            layer.apply_within(reach, features, graph, &rows, &mut room, &mut gamma);
             gamma
         }
 

@@ -90,9 +90,10 @@ pub(super) fn nearest(
     fill(points, order, graph, room);
 }
 
-/// Orders points so that every leaf of them is compact: halves at the median of the widest coordinate, leaves full.
+/// Orders points so that every leaf of them is compact, and within it every pair: halves at the median of the widest
+/// coordinate, leaves and pairs full.
 fn sort(entries: &mut [Entry]) {
-    if entries.len() <= LEAF {
+    if entries.len() <= 2 {
         entries.sort_unstable_by_key(|e| e.1);
         return;
     }
@@ -104,7 +105,8 @@ fn sort(entries: &mut [Entry]) {
     };
     let extents = [0, 1, 2].map(extent);
     let axis = (1..3).fold(0, |widest, a| if extents[a] > extents[widest] { a } else { widest });
-    let half = entries.len().div_ceil(LEAF).div_ceil(2) * LEAF;
+    let unit = if entries.len() > LEAF { LEAF } else { 2 };
+    let half = entries.len().div_ceil(unit).div_ceil(2) * unit;
     entries.select_nth_unstable_by(half, |a, b| a.0[axis].total_cmp(&b.0[axis]).then(a.1.cmp(&b.1)));
     let (below, above) = entries.split_at_mut(half);
     sort(below);
