@@ -8,7 +8,8 @@ use anyhow::{Context, Result};
 use clap::ValueEnum;
 use upcr_lab::data::{self, Split, pairs::POINTS};
 use upcr_lab::files::write_atomically;
-use upcr_lab::models::weights::{TensorFile, restore, store};
+use upcr_lab::models::Learned;
+use upcr_lab::models::weights::TensorFile;
 use upcr_lab::train::{Poses, TrainingConfig, adapt};
 
 use crate::output;
@@ -94,7 +95,7 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 fn learn(args: &Args) -> Result<ExitCode> {
     let bytes = std::fs::read(&args.weights).with_context(|| args.weights.display().to_string())?;
     let file = TensorFile::from_bytes(&bytes, &args.weights)?;
-    let network = restore(&file, &args.weights, &args.backend.device().autodiff())?;
+    let network = Learned::restore(&file, &args.weights, &args.backend.device().autodiff())?;
     let shapes = Arc::new(data::open(&args.clouds, args.split.into())?);
     output::note(&format!("{} clouds to learn from", shapes.len()));
     std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
@@ -106,7 +107,7 @@ fn learn(args: &Args) -> Result<ExitCode> {
     let mut teller = Teller::new()?;
     let done = adapt(&network, &shapes, &mixture, poses, config.clone(), &args.out, &mut teller)?;
     let path = args.out.join("weights.safetensors");
-    write_atomically(&path, &store(&done.network).to_bytes()?)?;
+    write_atomically(&path, &done.network.store().to_bytes()?)?;
     let [before, after] = done.errors;
     let report = serde_json::json!({
         "before": before,

@@ -1,6 +1,6 @@
 //! `upcr eval`: methods side by side on the pairs of a protocol.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 
@@ -12,6 +12,8 @@ use upcr_lab::data::pairs::Protocol;
 use upcr_lab::eval::methods::EvaluatedMethod;
 use upcr_lab::eval::run::{csv, evaluate, markdown};
 use upcr_lab::files::write_atomically;
+#[cfg(feature = "train")]
+use upcr_lab::models::{Learned, weights::TensorFile};
 
 use crate::output::{self, Progress};
 use crate::pairs::Pairs;
@@ -28,7 +30,8 @@ pub struct Args {
     /// Which part of its points a cloud keeps
     #[arg(long, value_enum, value_delimiter = ',', default_value = "consistent")]
     overlap: Vec<Overlap>,
-    /// Methods: upcr (the network alone, once), upcr+refine, icp, gicp, fgr, consensus, features, default
+    /// Methods: upcr (the network alone, once), upcr+refine, icp, gicp, fgr, icp+spfh, icp+pfh, consensus, features, default; and trained
+    /// networks as NAME=WEIGHTS (dcp=run/weights.safetensors)
     #[arg(long, value_delimiter = ',', default_value = "upcr,upcr+refine,icp,fgr,default")]
     methods: Vec<String>,
     /// Weights of the network [default: those in the program]
@@ -74,12 +77,28 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     output::on_threads(args.threads, || compare(args))?
 }
 
+/// `NAME`, or `NAME=WEIGHTS`.
+fn evaluated(method: &str) -> Result<EvaluatedMethod> {
+    let Some((name, path)) = method.split_once('=') else { return Ok(EvaluatedMethod::by_name(method)?) };
+    let path = Path::new(path);
+    #[cfg(feature = "train")]
+    {
+        let bytes = std::fs::read(path).with_context(|| path.display().to_string())?;
+        let file = TensorFile::from_bytes(&bytes, path)?;
+        let network = Learned::restore(&file, path, &upcr_lab::Device::flex())?;
+        if !matches!(network, Learned::Upcr(_)) {
+            return Ok(EvaluatedMethod::learned(name, network));
+        }
+    }
+    Ok(EvaluatedMethod::by_name("upcr")?.with_network(name, Network::load(path)?))
+}
+
 fn compare(args: &Args) -> Result<ExitCode> {
     if let Some(path) = &args.out {
         output::check_folder(path)?;
     }
     let methods: Vec<EvaluatedMethod> =
-        args.methods.iter().map(|name| EvaluatedMethod::by_name(name)).collect::<Result<_, _>>()?;
+        args.methods.iter().map(|method| evaluated(method)).collect::<Result<_>>()?;
     let mut settings = Settings::default();
     if let Some(path) = &args.weights {
         settings.network = Some(Arc::new(Network::load(path)?));

@@ -5,6 +5,8 @@ mod adapt;
 mod convert;
 mod eval;
 mod features;
+#[cfg(feature = "train")]
+mod import;
 mod info;
 mod input;
 mod output;
@@ -58,6 +60,8 @@ enum Command {
     #[cfg(feature = "train")]
     Adapt(adapt::Args),
     Eval(eval::Args),
+    #[cfg(feature = "train")]
+    Import(import::Args),
 }
 
 fn main() -> ExitCode {
@@ -72,6 +76,8 @@ fn main() -> ExitCode {
         #[cfg(feature = "train")]
         Command::Adapt(args) => adapt::run(&args),
         Command::Eval(args) => eval::run(&args),
+        #[cfg(feature = "train")]
+        Command::Import(args) => import::run(&args),
     };
     outcome.unwrap_or_else(|error| {
         output::note(&format!("error: {}", describe(&error)));

@@ -11,6 +11,7 @@ use std::sync::Arc;
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use serde::Serialize;
+use upcr::features::MatchedFeature;
 use upcr::net::Network;
 use upcr::{Locks, Method, Refinement, Registration, RobustKernel, Settings, io};
 
@@ -36,6 +37,9 @@ pub struct Args {
     /// Weights of the network [default: those in the program]
     #[arg(long, value_name = "FILE")]
     weights: Option<PathBuf>,
+    /// The feature that is matched, where the method matches one
+    #[arg(long, value_enum, default_value_t = Settings::default().feature)]
+    feature: MatchedFeature,
     /// What the refinement minimises
     #[arg(long, value_enum, default_value_t = Settings::default().refine)]
     refine: Refinement,
@@ -100,6 +104,7 @@ impl Args {
         Ok(Settings {
             method: self.method,
             network: self.weights.as_deref().map(Network::load).transpose()?.map(Arc::new),
+            feature: self.feature,
             refine: self.refine,
             voxel_size: self.voxel_size,
             init: self.init.as_deref().map(io::read_transform).transpose()?,

@@ -11,6 +11,7 @@ use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 use upcr_lab::data::{Shapes, Split};
 use upcr_lab::files::write_atomically;
+use upcr_lab::models::LearnedConfig;
 use upcr_lab::train::{Event, Trainer, TrainingConfig, Watcher, write_history};
 
 use crate::output;
@@ -24,7 +25,7 @@ Files in the run's folder:
   history.csv              the learning curve
   history.svg              the same as a plot";
 
-/// Learn a network from shapes, without labels
+/// Learn a network from shapes; UPCR without labels
 #[derive(clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub struct Args {
@@ -43,6 +44,10 @@ pub struct Args {
     /// Settings as TOML, instead of a preset
     #[arg(long, value_name = "FILE", conflicts_with = "preset")]
     config: Option<PathBuf>,
+    /// Network in place of the settings' (narrow in `quick`): upcr; pointnetlk, dcp-v1, dcp-v2, prnet, prnet*, which learn
+    /// from true poses
+    #[arg(long, value_name = "NAME")]
+    network: Option<String>,
     /// A setting to change, as in TOML: `--set network.invariant=none`, `--set 'network.widths=[8, 16, 32]'`; may be given
     /// several times
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -60,7 +65,7 @@ pub struct Args {
     #[arg(long, value_name = "DIR", required_unless_present = "resume")]
     out: Option<PathBuf>,
     /// Go on with the run in this folder, as it was started
-    #[arg(long, value_name = "RUN", conflicts_with_all = ["data", "protocol", "partial", "preset", "config", "changes", "seed", "out"])]
+    #[arg(long, value_name = "RUN", conflicts_with_all = ["data", "protocol", "partial", "preset", "config", "network", "changes", "seed", "out"])]
     resume: Option<PathBuf>,
 }
 
@@ -150,6 +155,11 @@ fn start(args: &Args, device: &upcr_lab::Device) -> Result<(PathBuf, Run, Traine
         (None, Preset::Paper) => TrainingConfig::default(),
         (None, Preset::Quick) => TrainingConfig::quick(),
     };
+    if let Some(name) = &args.network {
+        let network = LearnedConfig::by_name(name)?;
+        let narrow = args.config.is_none() && matches!(args.preset, Preset::Quick);
+        training.network = if narrow { network.narrow() } else { network };
+    }
     for change in &args.changes {
         training = training.with(change).with_context(|| format!("--set {change}"))?;
     }

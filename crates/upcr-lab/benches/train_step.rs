@@ -5,8 +5,9 @@
 
 use std::time::Instant;
 
+use upcr::{Rigid, net::NetworkConfig};
 use upcr_lab::Device;
-use upcr_lab::models::{CloudInput, Clouds};
+use upcr_lab::models::{Batch, LearnedConfig};
 use upcr_lab::random;
 use upcr_lab::train::{Trainer, TrainingConfig};
 
@@ -20,22 +21,23 @@ fn main() {
         return;
     };
     let mut config = TrainingConfig::default();
-    config.network.k = narrower.first().copied().unwrap_or(config.network.k);
+    let mut network = NetworkConfig::default();
+    network.k = narrower.first().copied().unwrap_or(network.k);
     let divisor = narrower.get(1).copied().unwrap_or(1);
-    config.network.widths.iter_mut().chain(&mut config.network.head).for_each(|width| *width /= divisor);
+    network.widths.iter_mut().chain(&mut network.head).for_each(|width| *width /= divisor);
+    config.network = LearnedConfig::Upcr(network);
     let mut rng = random::stream(1, 0);
     let mut cloud = || -> Vec<[f32; 3]> {
         (0..points).map(|_| random::direction(&mut rng).map(|v| v as f32).into()).collect()
     };
-    let mut input = || CloudInput::new(&cloud(), &config.network).unwrap();
-    let inputs: Vec<_> = (0..pairs).map(|_| (input(), input())).collect();
-    let clouds = Clouds::new(&inputs, config.network.k);
+    let inputs: Vec<_> = (0..pairs).map(|_| config.network.input(cloud(), cloud()).unwrap()).collect();
+    let batch = Batch::new(&inputs, vec![Rigid::identity(); pairs]);
     let folder = std::env::temp_dir();
     let mut trainer = Trainer::new(config, &folder, &Device::flex()).unwrap();
     let mut times_ms: Vec<f64> = (0..=repeats)
         .map(|_| {
             let start = Instant::now();
-            trainer.step(&clouds, 1e-3).unwrap();
+            trainer.step(&batch, 1e-3).unwrap();
             start.elapsed().as_secs_f64() * 1e3
         })
         .skip(1)

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::{
     CloudRole, Error, PointCloud, Result,
     cloud::orient_by_curvature,
-    features::{Descriptors, Feature, FeatureInput, Fpfh},
+    features::{Descriptors, Feature, FeatureInput},
     hypothesis::{Hypothesis, Match, Problem, SOURCES, are_alike, match_levels, separation},
     prepare::{Described, Level, Prepared, check, derive_voxel_size, prepare},
     refine::{Icp, LockedPose, Refined, Refinement, Schedule, factor},
@@ -187,7 +187,8 @@ impl<'a> Pipeline<'a> {
 
     fn feature_matches(&self) -> Result<Vec<Match>> {
         let (a, b) = (self.source.coarse(), self.target.coarse());
-        let (da, db) = rayon::join(|| describe(a), || describe(b));
+        let feature = self.settings.feature.feature();
+        let (da, db) = rayon::join(|| describe(a, feature), || describe(b, feature));
         Ok(match_levels((a, &da?), (b, &db?)))
     }
 
@@ -367,12 +368,12 @@ fn keep_promising(scored: &mut Vec<(f64, Hypothesis)>, count: usize) {
 /// Matched points lie this many coarse voxels apart at most under a right pose.
 const TOLERANCE_VOXELS: f32 = 1.5;
 
-fn describe(level: &Level) -> Result<Descriptors> {
+fn describe(level: &Level, feature: &dyn Feature) -> Result<Descriptors> {
     let neighborhoods = level.feature_graph();
     let mut normals = level.normals.clone();
     orient_by_curvature(&level.points, &mut normals, &neighborhoods);
     let input = FeatureInput { points: &level.points, normals: &normals, neighborhoods: &neighborhoods };
-    Fpfh.compute(&input)
+    feature.compute(&input)
 }
 
 fn to_local(file: &Rigid, source: &Prepared, target: &Prepared) -> Rigid {

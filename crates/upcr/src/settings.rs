@@ -7,6 +7,7 @@ use serde::{Serialize, Serializer};
 
 use crate::{
     Error, Result,
+    features::MatchedFeature,
     net::Network,
     refine::{Locks, Refinement, RobustKernel},
     transform::Rigid,
@@ -43,6 +44,8 @@ pub struct Settings {
     /// The network that is asked; `None`: the one in the library.
     #[serde(serialize_with = "fingerprint")]
     pub network: Option<Arc<Network>>,
+    /// The feature that is matched, where the method matches one.
+    pub feature: MatchedFeature,
     /// What the refinement minimises.
     pub refine: Refinement,
     /// The one scale that drives every radius, in the clouds' unit; `None`: derived from the clouds.
@@ -66,6 +69,7 @@ impl Default for Settings {
         Self {
             method: Method::Auto,
             network: None,
+            feature: MatchedFeature::default(),
             refine: Refinement::Gicp,
             voxel_size: None,
             init: None,

@@ -194,3 +194,36 @@ fn bad_requests_are_refused() {
     upcr(["eval", "--data", &shapes, "--methods", "magic"]).assert_fails(1, &["magic"]);
     assert_eq!(upcr(["train", "--data", &shapes]).status, 2);
 }
+
+#[test]
+fn other_networks_are_trained_and_evaluated() {
+    let scratch = Scratch::new();
+    let (shapes, settings) = (shapes(&scratch), scratch.file("run.toml", SETTINGS));
+    let folder = scratch.path("run");
+    let start = ["train", "--data", &shapes, "--config", &settings, "--network"];
+    let narrow = ["pointnetlk", "--set", "network.widths=[8, 8, 8, 16, 32]", "--out", &folder];
+    let run = upcr(start.into_iter().chain(narrow));
+    assert_eq!(run.status, 0, "{}", run.stderr);
+
+    let weights = format!("{folder}/weights.safetensors");
+    let method = format!("lucas-kanade={weights}");
+    let run = upcr(["eval", "--data", &shapes, "--methods", &method]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    assert!(run.stdout.contains("| lucas-kanade | "), "{}", run.stdout);
+
+    upcr(start.into_iter().chain(["pointnet", "--out", &folder])).assert_fails(1, &["pointnetlk", "prnet*"]);
+    upcr(["eval", "--data", &shapes, "--methods", "lucas-kanade=absent"]).assert_fails(1, &["absent"]);
+    // Only UPCR's weights register.
+    let cloud = format!("{shapes}/00.xyz");
+    upcr(["register", &cloud, &cloud, "--weights", &weights]).assert_fails(1, &["weights.safetensors"]);
+}
+
+#[test]
+fn what_is_no_published_network_is_not_imported() {
+    let scratch = Scratch::new();
+    let out = scratch.path("out.safetensors");
+    let text = scratch.file("text.t7", "no pickle");
+    upcr(["import", &text, "--out", &out]).assert_fails(1, &["text.t7"]);
+    upcr(["import", "absent.t7", "--out", &out]).assert_fails(1, &["absent.t7"]);
+    assert!(!Path::new(&out).exists());
+}

@@ -1,26 +1,39 @@
 //! The methods that evaluations compare, each as a function from a pair of clouds to a pose.
 
+use std::sync::Arc;
+#[cfg(feature = "train")]
+use std::sync::{Mutex, PoisonError};
+
+use upcr::features::MatchedFeature;
 use upcr::net::Network;
 use upcr::{Error, Method, PointCloud, Refinement, Result, Rigid, Settings, register};
+
+#[cfg(feature = "train")]
+use crate::models::Learned;
+
+/// What a method does with a source and a target.
+type Estimate = dyn Fn(&PointCloud, &PointCloud, &Settings) -> Result<Rigid> + Send + Sync;
 
 /// A method under its name.
 #[derive(Clone)]
 pub struct EvaluatedMethod {
     /// As a user types it.
-    pub name: &'static str,
-    estimate: fn(&PointCloud, &PointCloud, &Settings) -> Result<Rigid>,
+    pub name: String,
+    estimate: Arc<Estimate>,
 }
 
-/// Every method there is. A new one is a line here.
-pub const METHODS: [EvaluatedMethod; 8] = [
-    EvaluatedMethod { name: "upcr", estimate: one_pass },
-    EvaluatedMethod { name: "upcr+refine", estimate: one_pass_refined },
-    EvaluatedMethod { name: "icp", estimate: icp },
-    EvaluatedMethod { name: "gicp", estimate: gicp },
-    EvaluatedMethod { name: "fgr", estimate: fgr },
-    EvaluatedMethod { name: "consensus", estimate: consensus },
-    EvaluatedMethod { name: "features", estimate: features },
-    EvaluatedMethod { name: "default", estimate: default },
+/// Every method that needs no file. A new one is a line here.
+const METHODS: [(&str, fn(&PointCloud, &PointCloud, &Settings) -> Result<Rigid>); 10] = [
+    ("upcr", one_pass),
+    ("upcr+refine", one_pass_refined),
+    ("icp", icp),
+    ("gicp", gicp),
+    ("fgr", fgr),
+    ("icp+spfh", icp_spfh),
+    ("icp+pfh", icp_pfh),
+    ("consensus", consensus),
+    ("features", features),
+    ("default", default),
 ];
 
 impl EvaluatedMethod {
@@ -29,11 +42,38 @@ impl EvaluatedMethod {
     /// # Errors
     /// Where there is none.
     pub fn by_name(name: &str) -> Result<Self> {
-        METHODS.into_iter().find(|method| method.name == name).ok_or_else(|| {
-            let known: Vec<_> = METHODS.iter().map(|method| method.name).collect();
-            let reason = format!("there is no {name}; there are {}", known.join(", "));
-            Error::InvalidSetting { name: "methods", reason }
-        })
+        let found = METHODS.into_iter().find(|(known, _)| *known == name);
+        found.map(|(name, estimate)| Self { name: name.into(), estimate: Arc::new(estimate) }).ok_or_else(
+            || {
+                let known = METHODS.map(|(name, _)| name).join(", ");
+                let reason =
+                    format!("there is no {name}; there are {known}, and NAME=WEIGHTS for trained networks");
+                Error::InvalidSetting { name: "methods", reason }
+            },
+        )
+    }
+
+    /// A network of any kind, alone. Weights of UPCR's are better given to `upcr`, which runs them many times faster.
+    #[cfg(feature = "train")]
+    pub fn learned(name: &str, network: Learned) -> Self {
+        // A network's tensors are not shared between threads.
+        let network = Mutex::new(network);
+        let estimate = move |source: &PointCloud, target: &PointCloud, _: &Settings| {
+            let network = network.lock().unwrap_or_else(PoisonError::into_inner).clone();
+            network.predict(single(source), single(target))
+        };
+        Self { name: name.into(), estimate: Arc::new(estimate) }
+    }
+
+    /// The same method with a network of its own, under another name.
+    #[must_use]
+    pub fn with_network(self, name: &str, network: Network) -> Self {
+        let network = Arc::new(network);
+        let estimate = move |source: &PointCloud, target: &PointCloud, settings: &Settings| {
+            let settings = Settings { network: Some(network.clone()), ..settings.clone() };
+            self.estimate(source, target, &settings)
+        };
+        Self { name: name.into(), estimate: Arc::new(estimate) }
     }
 
     /// The pose that lays `source` on `target`. `settings` say with which network and seed.
@@ -45,10 +85,12 @@ impl EvaluatedMethod {
     }
 }
 
+fn single(cloud: &PointCloud) -> Vec<[f32; 3]> {
+    cloud.points.iter().map(|p| p.map(|v| v as f32)).collect()
+}
+
 /// The network alone, once.
 fn one_pass(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
-    let single =
-        |cloud: &PointCloud| -> Vec<[f32; 3]> { cloud.points.iter().map(|p| p.map(|v| v as f32)).collect() };
     let network = settings.network.clone().map_or_else(Network::embedded, Ok)?;
     network.predict(&single(source), &single(target))
 }
@@ -75,6 +117,29 @@ fn gicp(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result
 /// Fast Global Registration as published, without a refinement after it.
 fn fgr(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
     let settings = Settings { method: Method::Fgr, refine: Refinement::None, ..settings.clone() };
+    Ok(register(source, target, &settings)?.T_target_source)
+}
+
+/// The paper's ICP + SPFH: as [`icp_after`] has it.
+fn icp_spfh(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
+    icp_after(MatchedFeature::Spfh, source, target, settings)
+}
+
+/// The paper's ICP + PFH: as [`icp_after`] has it.
+fn icp_pfh(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
+    icp_after(MatchedFeature::Pfh, source, target, settings)
+}
+
+/// The pose of nearest features that most of them agree with (RANSAC), and point-to-point ICP from there. The paper does
+/// not say how matches become a pose.
+fn icp_after(
+    feature: MatchedFeature,
+    source: &PointCloud,
+    target: &PointCloud,
+    settings: &Settings,
+) -> Result<Rigid> {
+    let settings =
+        Settings { method: Method::Ransac, feature, refine: Refinement::Point, ..settings.clone() };
     Ok(register(source, target, &settings)?.T_target_source)
 }
 

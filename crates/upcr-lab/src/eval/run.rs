@@ -92,7 +92,7 @@ pub fn evaluate(
     let mean_ms = times_ms.iter().sum::<f64>() / times_ms.len() as f64;
     times_ms.sort_by(f64::total_cmp);
     Ok(Row {
-        method: method.name.into(),
+        method: method.name.clone(),
         protocol: name.into(),
         overlap: overlap_name(protocol.coverage).into(),
         noise: protocol.noise.map_or(0.0, |noise| noise.sigma),

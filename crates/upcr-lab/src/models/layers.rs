@@ -3,8 +3,27 @@
 use burn::module::{Module, Param, ParamId};
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng;
+use upcr::{Error, Result};
 
 use crate::ops::NormalizedMap;
+
+/// Refuses widths that no layer has.
+pub(super) fn check_channels(channels: usize) -> Result<()> {
+    if (1..=1 << 14).contains(&channels) {
+        return Ok(());
+    }
+    let reason = format!("a layer must have 1 to 16384 channels, not {channels}");
+    Err(Error::InvalidSetting { name: "channels", reason })
+}
+
+/// Whose statistics normalise.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Statistics {
+    /// The batch's: learning.
+    Batch,
+    /// The running ones: use.
+    Running,
+}
 
 /// A source of parameters: random values from a seed, and ids in the order of asking, so that equal networks are equal
 /// to the last bit.
@@ -19,6 +38,7 @@ impl<'a, R: Rng> Init<'a, R> {
         Self { rng, device, next_id: 0 }
     }
 
+    /// Whose gradient is learned from.
     fn parameter<const D: usize>(&mut self, values: Vec<f32>, shape: [usize; D]) -> Param<Tensor<D>> {
         self.next_id += 1;
         let tensor = Tensor::from_data(TensorData::new(values, shape), self.device);
@@ -27,19 +47,29 @@ impl<'a, R: Rng> Init<'a, R> {
     }
 
     /// Values that no gradient changes.
-    fn constant<const D: usize>(&mut self, value: f32, shape: [usize; D]) -> Param<Tensor<D>> {
+    pub fn constant<const D: usize>(&mut self, value: f32, shape: [usize; D]) -> Param<Tensor<D>> {
         self.next_id += 1;
         Param::initialized(ParamId::from(self.next_id), Tensor::full(shape, value, self.device))
     }
 
-    /// Uniform in ±√(1/inputs), as PyTorch draws the weights of linear maps.
-    fn weight(&mut self, inputs: usize, outputs: usize, gain: f32) -> Param<Tensor<2>> {
+    /// Uniform in ±gain·√(1/inputs), as PyTorch draws the parameters of linear maps.
+    pub fn uniform<const D: usize>(
+        &mut self,
+        inputs: usize,
+        gain: f32,
+        shape: [usize; D],
+    ) -> Param<Tensor<D>> {
         let limit = gain / (inputs.max(1) as f32).sqrt();
-        let values = (0..inputs * outputs).map(|_| self.rng.random_range(-limit..=limit)).collect();
-        self.parameter(values, [inputs, outputs])
+        let count = shape.iter().product();
+        let values = (0..count).map(|_| self.rng.random_range(-limit..=limit)).collect();
+        self.parameter(values, shape)
     }
 
-    fn filled(&mut self, value: f32, length: usize) -> Param<Tensor<1>> {
+    fn weight(&mut self, inputs: usize, outputs: usize, gain: f32) -> Param<Tensor<2>> {
+        self.uniform(inputs, gain, [inputs, outputs])
+    }
+
+    pub fn filled(&mut self, value: f32, length: usize) -> Param<Tensor<1>> {
         self.parameter(vec![value; length], [length])
     }
 }

@@ -11,7 +11,7 @@ use upcr::net::{GraphKind, Invariant, NetworkConfig};
 use upcr::{Result, Rigid};
 
 use super::input::Clouds;
-use super::layers::{Init, Linear, NormalizedLayer};
+use super::layers::{Init, Linear, NormalizedLayer, Statistics};
 use super::rotation::rotations;
 
 use crate::ops::{BatchGraph, Normalized, canonical_chamfer, edge_embed, graph_layer, pool_max};
@@ -85,15 +85,6 @@ pub fn init(config: &NetworkConfig, rng: &mut impl Rng, device: &Device) -> Resu
         })
         .collect();
     Ok(Upcr { global, embed, invariant, head, config: config.clone() })
-}
-
-/// Whose statistics normalise.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Statistics {
-    /// The batch's: learning.
-    Batch,
-    /// The running ones: use.
-    Running,
 }
 
 impl Upcr {

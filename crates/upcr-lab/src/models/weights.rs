@@ -3,13 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use burn::module::Param;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::Device;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use upcr::net::NetworkConfig;
 use upcr::{Error, Result};
 
-use super::layers::{Linear, NormalizedLayer};
+use super::named;
 use super::upcr::{Upcr, init};
 use crate::random;
 
@@ -92,8 +91,13 @@ impl TensorFile {
     }
 }
 
-fn malformed(path: &Path, reason: String) -> Error {
+pub(super) fn malformed(path: &Path, reason: String) -> Error {
     Error::Malformed { path: path.into(), format: "safetensors", reason }
+}
+
+/// The name in files of a field: the second branch's first map is a field beside the branch, and in files within it.
+fn stored_name(field: &str) -> String {
+    if field.starts_with("embed.") { format!("invariant.{field}") } else { field.to_owned() }
 }
 
 /// The network's weights with its configuration.
@@ -103,11 +107,8 @@ pub fn store(network: &Upcr) -> TensorFile {
     let config = serde_json::to_string(&network.config).unwrap_or_default();
     file.metadata.insert(CONFIG_KEY.into(), config);
     file.metadata.insert("upcr.version".into(), env!("CARGO_PKG_VERSION").into());
-    visit(network, &mut |name, tensor| {
-        let shape = tensor.shape().to_vec();
-        let values: Vec<f32> = tensor.iter::<f32>().collect();
-        file.tensors.insert(name, StoredTensor::from_f32(&values, &shape));
-    });
+    let tensors = named::tensors(network).into_iter();
+    file.tensors = tensors.map(|(field, tensor)| (stored_name(&field), tensor)).collect();
     file
 }
 
@@ -122,66 +123,6 @@ pub fn restore(file: &TensorFile, path: &Path, device: &Device) -> Result<Upcr> 
         .ok_or_else(|| malformed(path, format!("the metadata have no {CONFIG_KEY}")))?;
     let config: NetworkConfig =
         serde_json::from_str(config).map_err(|e| malformed(path, format!("{CONFIG_KEY}: {e}")))?;
-    let mut network = init(&config, &mut random::stream(0, 0), device)?;
-    fill(&mut network, file, path)?;
-    Ok(network)
-}
-
-fn normalized_names(network: &Upcr) -> Vec<String> {
-    let global = (0..network.global.len()).map(|l| format!("global.{l}"));
-    let embed = network.embed.iter().map(|_| "invariant.embed".to_owned());
-    let invariant = (0..network.invariant.len()).map(|l| format!("invariant.{l}"));
-    global.chain(embed).chain(invariant).collect()
-}
-
-fn visit(network: &Upcr, visitor: &mut impl FnMut(String, TensorData)) {
-    for (name, layer) in normalized_names(network).iter().zip(network.normalized_layers()) {
-        visitor(format!("{name}.weight"), layer.weight.val().into_data());
-        let vectors = [&layer.gamma, &layer.beta, &layer.mean, &layer.var];
-        for (part, tensor) in ["gamma", "beta", "mean", "var"].iter().zip(vectors) {
-            visitor(format!("{name}.{part}"), tensor.val().into_data());
-        }
-    }
-    for (l, linear) in network.head.iter().enumerate() {
-        visitor(format!("head.{l}.weight"), linear.weight.val().into_data());
-        visitor(format!("head.{l}.bias"), linear.bias.val().into_data());
-    }
-}
-
-fn fill(network: &mut Upcr, file: &TensorFile, path: &Path) -> Result<()> {
-    let names = normalized_names(network);
-    let layers = network.global.iter_mut().chain(&mut network.embed).chain(&mut network.invariant);
-    for (name, layer) in names.iter().zip(layers) {
-        let NormalizedLayer { weight, gamma, beta, mean, var } = layer;
-        replace(weight, &format!("{name}.weight"), file, path)?;
-        for (part, parameter) in [("gamma", gamma), ("beta", beta), ("mean", mean), ("var", var)] {
-            replace(parameter, &format!("{name}.{part}"), file, path)?;
-        }
-    }
-    for (l, Linear { weight, bias }) in network.head.iter_mut().enumerate() {
-        replace(weight, &format!("head.{l}.weight"), file, path)?;
-        replace(bias, &format!("head.{l}.bias"), file, path)?;
-    }
-    Ok(())
-}
-
-fn replace<const D: usize>(
-    parameter: &mut Param<Tensor<D>>,
-    name: &str,
-    file: &TensorFile,
-    path: &Path,
-) -> Result<()> {
-    let stored = file.tensors.get(name).ok_or_else(|| malformed(path, format!("{name} is missing")))?;
-    let old = parameter.val();
-    let shape = old.dims();
-    let values = stored
-        .to_f32()
-        .filter(|values| stored.shape == shape && values.iter().all(|v| v.is_finite()))
-        .ok_or_else(|| {
-            malformed(path, format!("{name} must be finite single-precision values of shape {shape:?}"))
-        })?;
-    let tensor = Tensor::from_data(TensorData::new(values, shape), &old.device());
-    let tensor = if old.is_require_grad() { tensor.require_grad() } else { tensor };
-    *parameter = Param::initialized(parameter.id, tensor);
-    Ok(())
+    let network = init(&config, &mut random::stream(0, 0), device)?;
+    named::filled(network, file, path, stored_name)
 }

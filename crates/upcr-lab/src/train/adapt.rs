@@ -10,13 +10,13 @@ use super::history::{ValidationErrors, Watcher, write_history};
 use super::trainer::{Poses, Trainer, Validation, validate};
 use crate::data::Shapes;
 use crate::data::pairs::Mixture;
-use crate::models::Upcr;
+use crate::models::Learned;
 
 /// What came of an adaptation.
 #[derive(Debug)]
 pub struct Adaptation {
     /// The better network: the adapted one, or the old one where its loss is not lower.
-    pub network: Upcr,
+    pub network: Learned,
     /// Whether the network is the adapted one.
     pub helped: bool,
     /// On the clouds' own pairs before, and after.
@@ -27,12 +27,12 @@ pub struct Adaptation {
 
 impl TrainingConfig {
     /// The paper's fine-tuning: 200 epochs from a step size of 1e-4, on clouds of so many points.
-    pub fn adaptation(network: &Upcr, points: usize, epochs: u64) -> Self {
+    pub fn adaptation(network: &Learned, points: usize, epochs: u64) -> Self {
         Self {
             stages: vec![Stage { points, k: None, batch: 26, length: Length::Epochs(epochs) }],
             learning_rate: 1e-4,
             decay: Decay::Cosine,
-            network: network.config.clone(),
+            network: network.config(),
             ..Self::default()
         }
     }
@@ -44,7 +44,7 @@ impl TrainingConfig {
 /// # Errors
 /// As [`Trainer::run`].
 pub fn adapt(
-    network: &Upcr,
+    network: &Learned,
     shapes: &Arc<Shapes>,
     mixture: &Mixture,
     poses: Poses,
@@ -53,11 +53,11 @@ pub fn adapt(
     watcher: &mut dyn Watcher,
 ) -> Result<Adaptation> {
     let points = config.stages.last().map_or(crate::data::pairs::POINTS, |stage| stage.points);
-    let validation = Validation::new(shapes, mixture, points, &network.config)?;
-    let before = validate(network, &validation);
+    let validation = Validation::new(shapes, mixture, points, &network.config())?;
+    let before = validate(network, &validation)?;
     let mut trainer = Trainer::adapting(config, network, folder)?;
     let finished = trainer.run_on(shapes, shapes, mixture, poses, watcher)?;
-    let after = validate(trainer.network(), &validation);
+    let after = validate(trainer.network(), &validation)?;
     let helped = after.loss < before.loss;
     let network = if helped { trainer.network() } else { network }.clone();
     write_history(folder, trainer.history())?;

@@ -12,8 +12,8 @@ use upcr::{Error, Result};
 use super::config::TrainingConfig;
 use super::history::History;
 use crate::files::write_atomically;
-use crate::models::Upcr;
-use crate::models::weights::{StoredTensor, TensorFile, restore, store};
+use crate::models::Learned;
+use crate::models::weights::{StoredTensor, TensorFile};
 
 const OPTIMIZER: &str = "optimizer";
 const STATE_KEY: &str = "upcr.training";
@@ -29,9 +29,9 @@ pub(super) struct State {
     pub history: History,
 }
 
-pub(super) fn save(path: &Path, state: &State, network: &Upcr, optimizer: &ModuleOptimizer) -> Result<()> {
+pub(super) fn save(path: &Path, state: &State, network: &Learned, optimizer: &ModuleOptimizer) -> Result<()> {
     let failed = |reason: String| Error::InvalidSetting { name: "checkpoint", reason };
-    let mut file = store(network);
+    let mut file = network.store();
     let bytes = optimizer.into_bytes().map_err(|e| failed(e.to_string()))?.to_vec();
     let stored = StoredTensor { dtype: Dtype::U8, shape: vec![bytes.len()], bytes };
     file.tensors.insert(OPTIMIZER.into(), stored);
@@ -44,13 +44,13 @@ pub(super) fn load(
     path: &Path,
     optimizer: ModuleOptimizer,
     device: &Device,
-) -> Result<(State, Upcr, ModuleOptimizer)> {
+) -> Result<(State, Learned, ModuleOptimizer)> {
     let malformed = |reason: String| Error::Malformed { path: path.into(), format: "checkpoint", reason };
     let bytes = fs::read(path).map_err(|source| Error::Io { path: path.into(), source })?;
     let file = TensorFile::from_bytes(&bytes, path)?;
     let state = file.metadata.get(STATE_KEY).ok_or_else(|| malformed(format!("has no {STATE_KEY}")))?;
     let state = serde_json::from_str(state).map_err(|e| malformed(format!("{STATE_KEY}: {e}")))?;
-    let network = restore(&file, path, device)?;
+    let network = Learned::restore(&file, path, device)?;
     let stored = file.tensors.get(OPTIMIZER).ok_or_else(|| malformed(format!("has no {OPTIMIZER}")))?;
     let optimizer = optimizer
         .from_bytes(Bytes::from_bytes_vec(stored.bytes.clone()))

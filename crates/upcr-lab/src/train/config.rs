@@ -1,8 +1,9 @@
 //! What a training run is told; its file form is TOML.
 
 use serde::{Deserialize, Serialize};
-use upcr::net::NetworkConfig;
 use upcr::{Error, Result};
+
+use crate::models::LearnedConfig;
 
 /// A training run. The default is the paper's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -25,7 +26,7 @@ pub struct TrainingConfig {
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
     /// The network.
-    pub network: NetworkConfig,
+    pub network: LearnedConfig,
 }
 
 /// A part of a run with clouds of one size.
@@ -77,7 +78,7 @@ impl Default for TrainingConfig {
             validation_every_nth: 20,
             validation_steps: 1000,
             checkpoint_seconds: 60.0,
-            network: NetworkConfig::default(),
+            network: LearnedConfig::default(),
         }
     }
 }
@@ -95,11 +96,7 @@ impl TrainingConfig {
             decay: Decay::Cosine,
             warmup_steps: 200,
             validation_steps: 1000,
-            network: NetworkConfig {
-                widths: vec![16, 16, 32, 64, 128],
-                head: vec![128, 64],
-                ..NetworkConfig::default()
-            },
+            network: LearnedConfig::default().narrow(),
             ..Self::default()
         }
     }
@@ -186,6 +183,28 @@ fn merge(table: &mut toml::Table, changed: toml::Table) {
 mod tests {
     use super::*;
 
+    fn upcr(config: &TrainingConfig) -> upcr::net::NetworkConfig {
+        match &config.network {
+            LearnedConfig::Upcr(network) => network.clone(),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn every_network_comes_back_from_its_file_form() {
+        for name in crate::models::learned::NETWORKS {
+            let network = LearnedConfig::by_name(name).unwrap();
+            for network in [network.narrow(), network] {
+                let config = TrainingConfig { network, ..TrainingConfig::quick() };
+                config.check().unwrap();
+                assert_eq!(TrainingConfig::from_toml(&config.to_toml()).unwrap(), config, "{name}");
+            }
+        }
+        assert!(LearnedConfig::by_name("dcp").is_err());
+        let unknown = TrainingConfig::from_toml("[network]\nkind = \"pointnet\"").unwrap_err();
+        assert!(unknown.to_string().contains("there are upcr, dcp"), "{unknown}");
+    }
+
     #[test]
     fn presets_come_back_from_their_file_form() {
         for config in [TrainingConfig::default(), TrainingConfig::quick()] {
@@ -214,9 +233,10 @@ mod tests {
     fn single_settings_change_and_the_others_stay() {
         let quick = TrainingConfig::quick();
         let whole = quick.with("network.invariant=none").unwrap();
-        assert_eq!(whole.network.invariant, upcr::net::Invariant::None);
-        assert_eq!((&whole.stages, &whole.network.widths), (&quick.stages, &quick.network.widths));
-        assert_eq!(quick.with("network.widths=[4, 8]").unwrap().network.widths, [4, 8]);
+        let (quick_network, whole_network) = (upcr(&quick), upcr(&whole));
+        assert_eq!(whole_network.invariant, upcr::net::Invariant::None);
+        assert_eq!((&whole.stages, &whole_network.widths), (&quick.stages, &quick_network.widths));
+        assert_eq!(upcr(&quick.with("network.widths=[4, 8]").unwrap()).widths, [4, 8]);
         assert_eq!(quick.with("learning_rate = 0.5").unwrap().learning_rate, 0.5);
         for change in ["learning_rate", "learning_rate=fast", "learnin_rate=1.0", "network.k=0"] {
             assert!(quick.with(change).is_err(), "{change}");

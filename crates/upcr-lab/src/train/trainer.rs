@@ -4,11 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use burn::module::Module;
 use burn::optim::{AdamConfig, GradientsParams, ModuleOptimizer};
 use burn::tensor::Device;
-use upcr::net::NetworkConfig;
-use upcr::{Error, Result, Rigid};
+use upcr::{Error, Result};
 
 use super::checkpoint::{self, State};
 use super::config::{Length, Stage, TrainingConfig};
@@ -18,8 +16,8 @@ pub use crate::data::loader::Poses;
 use crate::data::loader::{Example, Loader, Plan, Position, Training};
 use crate::data::pairs::Mixture;
 use crate::eval::metrics::{PoseErrors, Recall, Tolerance};
-use crate::models::weights::{TensorFile, store};
-use crate::models::{CloudInput, Clouds, Statistics, Upcr, init};
+use crate::models::weights::TensorFile;
+use crate::models::{Batch, Learned, LearnedConfig};
 use crate::random;
 
 /// Share of a batch in the running statistics of batch norm.
@@ -36,7 +34,7 @@ const DIAMETER: f64 = 2.0;
 /// A training run.
 pub struct Trainer {
     folder: PathBuf,
-    network: Upcr,
+    network: Learned,
     optimizer: ModuleOptimizer,
     state: State,
 }
@@ -44,7 +42,7 @@ pub struct Trainer {
 /// Pairs with known poses, to see how far a network has come.
 #[derive(Debug)]
 pub struct Validation {
-    batches: Vec<(Clouds, Vec<Rigid>)>,
+    batches: Vec<Batch>,
 }
 
 impl Validation {
@@ -52,7 +50,7 @@ impl Validation {
     ///
     /// # Errors
     /// Where a shape has too few points.
-    pub fn new(shapes: &Shapes, mixture: &Mixture, points: usize, config: &NetworkConfig) -> Result<Self> {
+    pub fn new(shapes: &Shapes, mixture: &Mixture, points: usize, config: &LearnedConfig) -> Result<Self> {
         const BATCH: usize = 32;
         let mut batches = Vec::new();
         for (protocol, _) in mixture {
@@ -63,15 +61,12 @@ impl Validation {
                 let mut truths = Vec::new();
                 for &item in items {
                     let pair = protocol.pair(&shapes.points(item), item as u64)?;
-                    let [source, target] = [&pair.source, &pair.target].map(|cloud| {
-                        let points: Vec<[f32; 3]> =
-                            cloud.points.iter().map(|p| p.map(|v| v as f32)).collect();
-                        CloudInput::new(&points, config)
-                    });
-                    pairs.push((source?, target?));
+                    let [source, target] = [&pair.source, &pair.target]
+                        .map(|cloud| cloud.points.iter().map(|p| p.map(|v| v as f32)).collect());
+                    pairs.push(config.input(source, target)?);
                     truths.push(pair.T_target_source);
                 }
-                batches.push((Clouds::new(&pairs, config.k), truths));
+                batches.push(Batch::new(&pairs, truths));
             }
         }
         Ok(Self { batches })
@@ -79,22 +74,24 @@ impl Validation {
 }
 
 /// Errors of a network, with its running statistics.
-pub fn validate(network: &Upcr, validation: &Validation) -> ValidationErrors {
-    let network = network.valid();
+///
+/// # Errors
+/// Where the pairs were made for another network.
+pub fn validate(network: &Learned, validation: &Validation) -> Result<ValidationErrors> {
     let mut poses = Vec::new();
-    let mut losses = Vec::new();
-    for (clouds, truths) in &validation.batches {
-        let output = network.forward(clouds, Statistics::Running);
-        losses.extend(output.loss(clouds).into_data().iter::<f32>().map(f64::from));
-        poses.extend(output.poses(clouds).into_iter().zip(truths.iter().copied()));
+    let mut loss = 0.0;
+    for batch in &validation.batches {
+        let (found, mean_loss) = network.judge(batch)?;
+        loss += mean_loss * found.len() as f64;
+        poses.extend(found.into_iter().zip(batch.truths().iter().copied()));
     }
     let errors = PoseErrors::of(&poses);
-    ValidationErrors {
-        loss: losses.iter().sum::<f64>() / losses.len().max(1) as f64,
+    Ok(ValidationErrors {
+        loss: loss / poses.len().max(1) as f64,
         mae_r_deg: errors.euler_mae_deg,
         mae_t: errors.translation_mae,
         recall: Recall::of(&poses, |_| Tolerance::object(DIAMETER)).share(),
-    }
+    })
 }
 
 impl Trainer {
@@ -105,7 +102,7 @@ impl Trainer {
     pub fn new(config: TrainingConfig, folder: &Path, device: &Device) -> Result<Self> {
         config.check()?;
         let device = device.clone().autodiff();
-        let network = init(&config.network, &mut random::stream(config.seed, u64::MAX), &device)?;
+        let network = config.network.init(config.seed, &device)?;
         let state = State { config, step: 0, seconds: 0.0, history: History::new() };
         Ok(Self { folder: folder.into(), network, optimizer: adam(), state })
     }
@@ -114,9 +111,9 @@ impl Trainer {
     ///
     /// # Errors
     /// Where the configuration cannot be run, or a checkpoint is damaged.
-    pub fn adapting(config: TrainingConfig, network: &Upcr, folder: &Path) -> Result<Self> {
+    pub fn adapting(config: TrainingConfig, network: &Learned, folder: &Path) -> Result<Self> {
         config.check()?;
-        let device = network.devices().into_iter().next().unwrap_or_default();
+        let device = network.device();
         if folder.join(CHECKPOINT).exists() {
             let stopped = Self::resume(folder, &device.inner())?;
             if stopped.state.config == config {
@@ -138,7 +135,7 @@ impl Trainer {
     }
 
     /// The network as it is now.
-    pub fn network(&self) -> &Upcr {
+    pub fn network(&self) -> &Learned {
         &self.network
     }
 
@@ -154,7 +151,7 @@ impl Trainer {
 
     /// The weights as a file.
     pub fn weights(&self) -> TensorFile {
-        store(&self.network)
+        self.network.store()
     }
 
     /// Trains to the end, or until the watcher says stop; `true` at the end. `shapes` are split into those to learn
@@ -224,20 +221,16 @@ impl Trainer {
             from: Position { epoch: done / per_epoch, batch: done % per_epoch },
         });
         let seen = place.stage.network(&config.network);
-        let k = seen.k;
-        let prepare = move |example: &Example| {
-            let cloud = |points| CloudInput::new(points, &seen);
-            Ok((cloud(&example.source)?, cloud(&example.target)?))
-        };
+        let prepare = move |example: &Example| seen.example(example);
         let mut batches = Loader::start(shapes, &plan, place.stage.batch, LOADER_THREADS, prepare)?;
         let mut since = Since::default();
         let mut saved = Instant::now();
         while self.state.step < place.end {
             let start = Instant::now();
             let Some(batch) = batches.next().transpose()? else { break };
-            let clouds = Clouds::new(&batch.prepared, k);
+            let batch = Batch::new(&batch.prepared, batch.T_target_source);
             let rate = config.step_size(self.state.step, place.steps);
-            let loss = self.step(&clouds, rate)?;
+            let loss = self.step(&batch, rate)?;
             self.state.step += 1;
             since.loss += loss;
             since.steps += 1;
@@ -252,7 +245,7 @@ impl Trainer {
                     steps: place.steps,
                     points: place.stage.points,
                     loss: since.loss / since.steps as f64,
-                    validation: validates.then(|| validate(&self.network, validation)),
+                    validation: validates.then(|| validate(&self.network, validation)).transpose()?,
                     learning_rate: rate,
                     clouds_per_second: (since.steps * 2 * place.stage.batch) as f64 / since.seconds,
                     seconds: self.state.seconds,
@@ -278,10 +271,10 @@ impl Trainer {
     /// One step of Adam on a batch; its mean loss.
     ///
     /// # Errors
-    /// Where the loss is not finite.
-    pub fn step(&mut self, clouds: &Clouds, rate: f64) -> Result<f64> {
-        let output = self.network.forward(clouds, Statistics::Batch);
-        let loss = output.loss(clouds).mean();
+    /// Where the loss is not finite, or the batch was made for another network.
+    pub fn step(&mut self, batch: &Batch, rate: f64) -> Result<f64> {
+        let seed = random::fnv1a(&format!("{} step {}", self.state.config.seed, self.state.step));
+        let (loss, statistics) = self.network.learn(batch, seed)?;
         let value = f64::from(loss.clone().into_scalar::<f32>());
         if !value.is_finite() {
             let reason = format!("the loss became {value} at step {}", self.state.step);
@@ -289,7 +282,7 @@ impl Trainer {
         }
         let gradients = GradientsParams::from_grads(loss.backward(), &self.network);
         let network = self.optimizer.step(rate, self.network.clone(), gradients);
-        self.network = network.observed(&output.statistics, STATISTICS_SHARE);
+        self.network = network.observed(&statistics, STATISTICS_SHARE);
         Ok(value)
     }
 
@@ -328,8 +321,8 @@ struct Place<'a> {
 
 impl Stage {
     /// The network's configuration as its inputs see it.
-    fn network(&self, config: &NetworkConfig) -> NetworkConfig {
-        NetworkConfig { k: self.k.unwrap_or(config.k), ..config.clone() }
+    fn network(&self, config: &LearnedConfig) -> LearnedConfig {
+        config.with_neighbors(self.k)
     }
 
     fn steps_per_epoch(&self, shapes: usize) -> u64 {

@@ -1,6 +1,7 @@
 //! Pose-invariant point features: one file each, one trait.
 
 use rayon::prelude::*;
+use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::neighbors::Neighborhoods;
@@ -42,6 +43,31 @@ pub const ALL: &[&dyn Feature] = &[&Distance, &Ppf, &Spfh, &Pfh, &Fpfh];
 /// The feature of that name.
 pub fn by_name(name: &str) -> Option<&'static dyn Feature> {
     ALL.iter().copied().find(|feature| feature.name() == name)
+}
+
+/// The feature that a registration matches.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[serde(rename_all = "snake_case")]
+#[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
+pub enum MatchedFeature {
+    /// Fast point feature histograms.
+    #[default]
+    Fpfh,
+    /// Simplified point feature histograms.
+    Spfh,
+    /// Point feature histograms, of all pairs in a neighbourhood.
+    Pfh,
+}
+
+impl MatchedFeature {
+    /// What computes it.
+    pub fn feature(self) -> &'static dyn Feature {
+        match self {
+            Self::Fpfh => &Fpfh,
+            Self::Spfh => &Spfh,
+            Self::Pfh => &Pfh,
+        }
+    }
 }
 
 /// A row a point, in parallel; `room` makes what a task reuses from row to row.

@@ -1,0 +1,104 @@
+//! Layers of the published networks, laid out as their files are: maps `[outputs, inputs]`, norms by channel.
+
+use burn::module::{Module, Param};
+use burn::tensor::Tensor;
+use rand::Rng;
+
+use super::layers::{Init, Statistics};
+
+/// A linear map of channels: PyTorch's `Linear`, and its convolutions over single points.
+#[derive(Module, Debug)]
+pub struct Dense {
+    /// `[outputs, inputs]`.
+    pub weight: Param<Tensor<2>>,
+    /// `[outputs]`.
+    pub bias: Option<Param<Tensor<1>>>,
+}
+
+impl Dense {
+    pub(super) fn init(inputs: usize, outputs: usize, init: &mut Init<impl Rng>) -> Self {
+        Self { bias: Some(init.uniform(inputs, 1.0, [outputs])), ..Self::without_bias(inputs, outputs, init) }
+    }
+
+    pub(super) fn without_bias(inputs: usize, outputs: usize, init: &mut Init<impl Rng>) -> Self {
+        Self { weight: init.uniform(inputs, 1.0, [outputs, inputs]), bias: None }
+    }
+
+    /// `[rows, inputs]` → `[rows, outputs]`.
+    pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        let y = x.matmul(self.weight.val().transpose());
+        match &self.bias {
+            Some(bias) => y + bias.val().unsqueeze(),
+            None => y,
+        }
+    }
+
+    /// `[batch, rows, inputs]` → `[batch, rows, outputs]`.
+    pub fn forward_batch(&self, x: Tensor<3>) -> Tensor<3> {
+        let [batch, rows, inputs] = x.dims();
+        let y = self.forward(x.reshape([batch * rows, inputs]));
+        let outputs = y.dims()[1];
+        y.reshape([batch, rows, outputs])
+    }
+}
+
+/// Batch norm over rows.
+#[derive(Module, Debug)]
+pub struct BatchNorm {
+    /// Scale, `[channels]`.
+    pub weight: Param<Tensor<1>>,
+    /// Shift, `[channels]`.
+    pub bias: Param<Tensor<1>>,
+    /// `[channels]`.
+    pub running_mean: Param<Tensor<1>>,
+    /// `[channels]`.
+    pub running_var: Param<Tensor<1>>,
+}
+
+/// What batch norm adds to a variance.
+const EPSILON: f64 = 1e-5;
+
+impl BatchNorm {
+    pub(super) fn init(channels: usize, init: &mut Init<impl Rng>) -> Self {
+        Self {
+            weight: init.filled(1.0, channels),
+            bias: init.filled(0.0, channels),
+            running_mean: init.constant(0.0, [channels]),
+            running_var: init.constant(1.0, [channels]),
+        }
+    }
+
+    /// `[rows, channels]`, normalised by the running statistics or by the batch's, which are added to `found`.
+    pub fn forward(&self, x: Tensor<2>, statistics: Statistics, found: &mut BatchStatistics) -> Tensor<2> {
+        let (mean, variance) = match statistics {
+            Statistics::Running => (self.running_mean.val().unsqueeze(), self.running_var.val().unsqueeze()),
+            Statistics::Batch => {
+                let rows = x.dims()[0] as f64;
+                let mean = x.clone().mean_dim(0);
+                let variance = (x.clone() - mean.clone()).square().mean_dim(0);
+                // The running variance is the unbiased one.
+                let unbiased = variance.clone().detach() * (rows / (rows - 1.0).max(1.0));
+                let channels = x.dims()[1];
+                found.push([mean.clone().detach().reshape([channels]), unbiased.reshape([channels])]);
+                (mean, variance)
+            }
+        };
+        let scale: Tensor<2> = (variance + EPSILON).sqrt().recip() * self.weight.val().unsqueeze();
+        (x - mean) * scale + self.bias.val().unsqueeze()
+    }
+
+    /// The norm with its running statistics moved by `share` towards a batch's.
+    #[must_use]
+    pub fn observed(mut self, batch: &[Tensor<1>; 2], share: f64) -> Self {
+        let [mean, variance] = batch;
+        let towards = |running: Tensor<1>, batch: &Tensor<1>| {
+            (running * (1.0 - share) + batch.clone() * share).detach()
+        };
+        self.running_mean = self.running_mean.map(|running| towards(running, mean));
+        self.running_var = self.running_var.map(|running| towards(running, variance));
+        self
+    }
+}
+
+/// Mean and variance of a batch in each of a network's norms, in the order in which they are used.
+pub type BatchStatistics = Vec<[Tensor<1>; 2]>;

@@ -1,0 +1,210 @@
+//! The point features of DCP and PRNet: dynamic graph convolutions (Wang et al., 2019), as these two use them.
+
+use std::sync::Arc;
+
+use burn::module::Module;
+use burn::tensor::activation::{leaky_relu, relu};
+use burn::tensor::{Int, Tensor, TensorData};
+use rand::Rng;
+use upcr::net::Graph;
+
+use super::dense::{BatchNorm, BatchStatistics, Dense};
+use super::layers::{Init, Statistics};
+use crate::ops::{BatchGraph, Normalized, NormalizedMap, graph_layer};
+
+/// Neighbours of a point, itself included.
+pub const K: usize = 20;
+/// Channels after each of the first four layers, which the fifth reads together.
+const WIDTHS: [usize; 4] = [64, 64, 128, 256];
+/// Slope of PRNet's rectifiers for negative values.
+pub(super) const NEGATIVE_SLOPE: f32 = 0.2;
+
+/// Over which edges the layers look.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Edges {
+    /// DCP: one graph, of positions; the features of edges go from layer to layer, and each layer's maximum over a point's
+    /// edges is kept for the last.
+    Kept,
+    /// PRNet: every layer has the graph of the features that it is given.
+    Dynamic,
+}
+
+/// Five maps and their norms. Fields are named as in the published files.
+#[derive(Module, Debug)]
+#[allow(missing_docs)]
+pub struct Dgcnn {
+    pub conv1: Dense,
+    pub conv2: Dense,
+    pub conv3: Dense,
+    pub conv4: Dense,
+    pub conv5: Dense,
+    pub bn1: BatchNorm,
+    pub bn2: BatchNorm,
+    pub bn3: BatchNorm,
+    pub bn4: BatchNorm,
+    pub bn5: BatchNorm,
+    #[module(skip)]
+    pub edges: Edges,
+}
+
+impl Dgcnn {
+    pub(super) fn init(edges: Edges, channels: usize, init: &mut Init<impl Rng>) -> Self {
+        let [a, b, c, d] = WIDTHS;
+        // A layer on the features of points sees an edge's two.
+        let ends = if edges == Edges::Dynamic { 2 } else { 1 };
+        Self {
+            conv1: Dense::without_bias(6, a, init),
+            conv2: Dense::without_bias(ends * a, b, init),
+            conv3: Dense::without_bias(ends * b, c, init),
+            conv4: Dense::without_bias(ends * c, d, init),
+            conv5: Dense::without_bias(a + b + c + d, channels, init),
+            bn1: BatchNorm::init(a, init),
+            bn2: BatchNorm::init(b, init),
+            bn3: BatchNorm::init(c, init),
+            bn4: BatchNorm::init(d, init),
+            bn5: BatchNorm::init(channels, init),
+            edges,
+        }
+    }
+
+    /// `[clouds, points, 3]` → `[clouds, points, channels]`.
+    pub fn forward(
+        &self,
+        points: &Tensor<3>,
+        statistics: Statistics,
+        found: &mut BatchStatistics,
+    ) -> Tensor<3> {
+        let [clouds, count, _] = points.dims();
+        let rows = points.clone().reshape([clouds * count, 3]);
+        let features = match self.edges {
+            Edges::Kept => self.on_kept_edges(rows, [clouds, count], statistics, found),
+            Edges::Dynamic => self.on_dynamic_edges(rows, [clouds, count], statistics, found),
+        };
+        let joined = self.bn5.forward(self.conv5.forward(Tensor::cat(features, 1)), statistics, found);
+        let joined = match self.edges {
+            Edges::Kept => relu(joined),
+            Edges::Dynamic => leaky_relu(joined, f64::from(NEGATIVE_SLOPE)),
+        };
+        let channels = joined.dims()[1];
+        joined.reshape([clouds, count, channels])
+    }
+
+    fn layers(&self) -> [(&Dense, &BatchNorm); 4] {
+        [
+            (&self.conv1, &self.bn1),
+            (&self.conv2, &self.bn2),
+            (&self.conv3, &self.bn3),
+            (&self.conv4, &self.bn4),
+        ]
+    }
+
+    fn on_kept_edges(
+        &self,
+        points: Tensor<2>,
+        [clouds, count]: [usize; 2],
+        statistics: Statistics,
+        found: &mut BatchStatistics,
+    ) -> Vec<Tensor<2>> {
+        let graph = graph_of(&points, [clouds, count]);
+        let k = graph.k;
+        let device = points.device();
+        let starts = (0..clouds).flat_map(|cloud| std::iter::repeat_n(cloud * count, count * k));
+        let ends = graph.neighbors.iter().zip(starts).map(|(&j, start)| (start + j as usize) as i32);
+        let ends = TensorData::new(ends.collect::<Vec<_>>(), [clouds * count * k]);
+        let neighbors = points.clone().select(0, Tensor::<1, Int>::from_data(ends, &device));
+        let centers =
+            points.reshape([clouds * count, 1, 3]).repeat_dim(1, k).reshape([clouds * count * k, 3]);
+        let mut edges = Tensor::cat(vec![neighbors, centers], 1);
+        let layers = self.layers().map(|(map, norm)| {
+            edges = relu(norm.forward(map.forward(edges.clone()), statistics, found));
+            let channels = edges.dims()[1];
+            edges
+                .clone()
+                .reshape([clouds * count, k, channels])
+                .max_dim(1)
+                .reshape([clouds * count, channels])
+        });
+        layers.to_vec()
+    }
+
+    fn on_dynamic_edges(
+        &self,
+        points: Tensor<2>,
+        sizes: [usize; 2],
+        statistics: Statistics,
+        found: &mut BatchStatistics,
+    ) -> Vec<Tensor<2>> {
+        let mut features = points;
+        let layers = self.layers().map(|(map, norm)| {
+            let graph = Arc::new(graph_of(&features, sizes));
+            let inputs = features.dims()[1];
+            // The published map is one of [Fⱼ ; Fᵢ], that of a graph layer of [Fᵢ ; Fⱼ − Fᵢ].
+            let weight = map.weight.val().transpose();
+            let (of_neighbor, of_center) =
+                (weight.clone().narrow(0, 0, inputs), weight.narrow(0, inputs, inputs));
+            let map = NormalizedMap {
+                weight: Tensor::cat(vec![of_center + of_neighbor.clone(), of_neighbor], 0),
+                gamma: norm.weight.val(),
+                beta: norm.bias.val(),
+                negative_slope: NEGATIVE_SLOPE,
+            };
+            let given = (statistics == Statistics::Running)
+                .then(|| [norm.running_mean.val(), norm.running_var.val()]);
+            let learned = given.is_none();
+            let Normalized { values, statistics } = graph_layer(features.clone(), map, &graph, given);
+            if learned {
+                found.push(statistics);
+            }
+            features = values.clone();
+            values
+        });
+        layers.to_vec()
+    }
+
+    /// The network with running statistics moved by `share` towards a batch's, taken from `batch` in the order of use.
+    #[must_use]
+    pub(super) fn observed<'a>(
+        self,
+        batch: &mut impl Iterator<Item = &'a [Tensor<1>; 2]>,
+        share: f64,
+    ) -> Self {
+        let mut observe = |norm: BatchNorm| match batch.next() {
+            Some(statistics) => norm.observed(statistics, share),
+            None => norm,
+        };
+        Self {
+            bn1: observe(self.bn1),
+            bn2: observe(self.bn2),
+            bn3: observe(self.bn3),
+            bn4: observe(self.bn4),
+            bn5: observe(self.bn5),
+            ..self
+        }
+    }
+}
+
+/// The nearest neighbours of every row among those of its cloud, itself included. Squared distances are computed as the
+/// published code does, from inner products in single precision: where two are nearly equal, its choice is made.
+fn graph_of(rows: &Tensor<2>, [clouds, count]: [usize; 2]) -> BatchGraph {
+    let channels = rows.dims()[1];
+    let x = rows.clone().detach().reshape([clouds, count, channels]);
+    let squares = x.clone().square().sum_dim(2);
+    let distances_sq = squares.clone() - x.clone().matmul(x.transpose()) * 2.0 + squares.transpose();
+    let distances_sq: Vec<f32> = distances_sq.into_data().iter::<f32>().collect();
+    let k = K.min(count);
+    let nearest = |row: &[f32]| {
+        let mut order: Vec<u32> = (0..count as u32).collect();
+        let by_distance = |a: &u32, b: &u32| row[*a as usize].total_cmp(&row[*b as usize]).then(a.cmp(b));
+        if k < count {
+            order.select_nth_unstable_by(k, by_distance);
+            order.truncate(k);
+        }
+        order.sort_unstable_by(by_distance);
+        order
+    };
+    let graphs: Vec<Graph> = distances_sq
+        .chunks_exact(count * count)
+        .map(|cloud| Graph { k, neighbors: cloud.chunks_exact(count).flat_map(nearest).collect() })
+        .collect();
+    BatchGraph::new(&graphs, k)
+}
