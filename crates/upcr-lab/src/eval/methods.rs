@@ -22,8 +22,11 @@ pub struct EvaluatedMethod {
     estimate: Arc<Estimate>,
 }
 
+/// A method that is a function.
+type Plain = fn(&PointCloud, &PointCloud, &Settings) -> Result<Rigid>;
+
 /// Every method that needs no file. A new one is a line here.
-const METHODS: [(&str, fn(&PointCloud, &PointCloud, &Settings) -> Result<Rigid>); 10] = [
+const METHODS: [(&str, Plain); 10] = [
     ("upcr", one_pass),
     ("upcr+refine", one_pass_refined),
     ("icp", icp),

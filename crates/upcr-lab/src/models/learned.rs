@@ -157,7 +157,7 @@ impl LearnedConfig {
         Ok(match self {
             Self::Upcr(config) => {
                 let (source, target) = (CloudInput::new(&source, config)?, CloudInput::new(&target, config)?);
-                PairInput::Clouds(source, target)
+                PairInput::Clouds(Box::new((source, target)))
             }
             _ => PairInput::Points(source, target),
         })
@@ -176,7 +176,7 @@ impl LearnedConfig {
 #[derive(Debug, Clone)]
 pub enum PairInput {
     /// With neighbours and invariant features.
-    Clouds(CloudInput, CloudInput),
+    Clouds(Box<(CloudInput, CloudInput)>),
     /// Coordinates alone.
     Points(Vec<[f32; 3]>, Vec<[f32; 3]>),
 }
@@ -203,7 +203,7 @@ impl Batch {
         let mut points = [Vec::new(), Vec::new()];
         for pair in pairs {
             match pair {
-                PairInput::Clouds(source, target) => clouds.push((source.clone(), target.clone())),
+                PairInput::Clouds(pair) => clouds.push((**pair).clone()),
                 PairInput::Points(source, target) => {
                     points[0].extend_from_slice(source.as_flattened());
                     points[1].extend_from_slice(target.as_flattened());
@@ -418,7 +418,8 @@ impl Learned {
         let transformer = |prefix: &str, channels: usize| -> Result<TransformerConfig> {
             let layer =
                 |block: usize| format!("{prefix}.model.encoder.layers.{block}.feed_forward.w_1.weight");
-            let blocks = (0..).take_while(|&block| file.tensors.contains_key(&layer(block))).count();
+            let blocks =
+                (0..file.tensors.len()).take_while(|&block| file.tensors.contains_key(&layer(block))).count();
             Ok(TransformerConfig { channels, heads: 4, blocks, inner: outputs(&layer(0))? })
         };
         let begins = |prefix: &str| file.tensors.keys().any(|name| name.starts_with(prefix));

@@ -294,7 +294,7 @@ fn exponential(twist: Tensor<3>) -> Tensor<3> {
         chosen((-angle.clone().cos() + 1.0) / angle_sq_safe.clone(), [0.5, -1.0 / 24.0, 1.0 / 720.0]);
     let third = (angle.clone() - angle.clone().sin()) / (angle_sq_safe * angle);
     let third = chosen(third, [1.0 / 6.0, -1.0 / 120.0, 1.0 / 5040.0]);
-    let cross = cross_matrix(w);
+    let cross = cross_matrix(&w);
     let squared = cross.clone().matmul(cross.clone());
     let identity = Tensor::<2>::eye(3, &device).unsqueeze::<3>();
     let rotation = cross.clone() * first + squared.clone() * second.clone() + identity.clone();

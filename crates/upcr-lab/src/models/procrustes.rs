@@ -29,11 +29,11 @@ pub fn rotation(covariance: Tensor<3>) -> Tensor<3> {
     let entry = |row: usize, column: usize| s.clone().narrow(1, row, 1).narrow(2, column, 1);
     let axis = [(2, 1), (0, 2), (1, 0)].map(|(a, b)| entry(a, b) - entry(b, a));
     let omega = inverse.matmul(Tensor::cat(axis.to_vec(), 1));
-    r.clone() + r.matmul(cross_matrix(omega))
+    r.clone() + r.matmul(cross_matrix(&omega))
 }
 
 /// `[batch, 3, 1]` → `[batch, 3, 3]`, the matrices of the cross products.
-pub(super) fn cross_matrix(v: Tensor<3>) -> Tensor<3> {
+pub(super) fn cross_matrix(v: &Tensor<3>) -> Tensor<3> {
     let [x, y, z] = [0, 1, 2].map(|axis| v.clone().narrow(1, axis, 1));
     let zero = x.zeros_like();
     let row = |entries: [Tensor<3>; 3]| Tensor::cat(entries.to_vec(), 2);

@@ -37,7 +37,7 @@ impl<T: Pooled> Buffer<T> {
         let mut pool = T::pool().lock().unwrap_or_else(PoisonError::into_inner);
         let fits = |values: &Vec<T>| values.len() >= length && values.len() <= 2 * length;
         let best = (0..pool.len()).filter(|&i| fits(&pool[i])).min_by_key(|&i| pool[i].len());
-        let waiting = best.map(|i| pool.swap_remove(i));
+        let waiting = best.map(|i| pool.remove(i));
         drop(pool);
         let mut values = waiting.unwrap_or_else(|| vec![T::default(); length]);
         values.truncate(length);
@@ -48,9 +48,14 @@ impl<T: Pooled> Buffer<T> {
 impl<T: Pooled> Drop for Buffer<T> {
     fn drop(&mut self) {
         let mut pool = T::pool().lock().unwrap_or_else(PoisonError::into_inner);
-        if !self.values.is_empty() && pool.len() < WAITING {
-            pool.push(std::mem::take(&mut self.values));
+        if self.values.is_empty() {
+            return;
         }
+        // The one that waits longest has least use.
+        if pool.len() == WAITING {
+            pool.remove(0);
+        }
+        pool.push(std::mem::take(&mut self.values));
     }
 }
 

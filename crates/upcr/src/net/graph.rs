@@ -86,7 +86,9 @@ impl PairedRows {
         let rows = graph.neighbors.chunks(2 * k.max(1));
         for (pair, (rows, places)) in rows.zip(self.neighbors.chunks_exact_mut(2 * k.max(1))).enumerate() {
             let (first, second) = rows.split_at(k);
-            first.iter().for_each(|&j| held_by[j as usize] = pair);
+            for &j in first {
+                held_by[j as usize] = pair;
+            }
             // Written in any case, counted where it belongs: there is no branch to guess.
             let [mut both, mut firsts, mut seconds] = [0; 3];
             for &j in second {
