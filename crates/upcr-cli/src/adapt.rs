@@ -9,7 +9,7 @@ use clap::ValueEnum;
 use upcr_lab::data::{self, Split, pairs::POINTS};
 use upcr_lab::files::write_atomically;
 use upcr_lab::models::Learned;
-use upcr_lab::models::weights::TensorFile;
+use upcr_lab::models::tensor_file::TensorFile;
 use upcr_lab::train::{Poses, TrainingConfig, adapt};
 
 use crate::output;

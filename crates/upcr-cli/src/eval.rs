@@ -13,7 +13,7 @@ use upcr_lab::eval::methods::EvaluatedMethod;
 use upcr_lab::eval::run::{csv, evaluate, markdown};
 use upcr_lab::files::write_atomically;
 #[cfg(feature = "train")]
-use upcr_lab::models::{Learned, weights::TensorFile};
+use upcr_lab::models::{Learned, tensor_file::TensorFile};
 
 use crate::output::{self, Progress};
 use crate::pairs::Pairs;

@@ -11,7 +11,7 @@ use upcr_lab::models::attention::TransformerConfig;
 use upcr_lab::models::dcp::DcpConfig;
 use upcr_lab::models::pointnetlk::PointNetLkConfig;
 use upcr_lab::models::prnet::{PrnetConfig, Sampler};
-use upcr_lab::models::weights::TensorFile;
+use upcr_lab::models::tensor_file::TensorFile;
 use upcr_lab::models::{Statistics, named, pytorch};
 use upcr_lab::random;
 
@@ -94,7 +94,7 @@ fn dcp_v1_is_the_authors() {
 #[test]
 fn dcp_v2_is_the_authors() {
     let Some(golden) = Golden::open("dcp_v2_small.safetensors") else { return };
-    let config = DcpConfig { channels: 64, pointer: Some(SMALL) };
+    let config = DcpConfig { channels: 64, pointer: Some(SMALL), ..DcpConfig::default() };
     let network = config.init(&mut random::stream(0, 0), &Device::flex());
     let network = named::filled(network, &golden.weights(), Path::new("golden"), str::to_owned).unwrap();
     let output = network.forward(&golden.cloud("source"), &golden.cloud("target"), Statistics::Running);

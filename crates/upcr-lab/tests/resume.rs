@@ -14,7 +14,7 @@ use upcr_lab::models::attention::TransformerConfig;
 use upcr_lab::models::dcp::DcpConfig;
 use upcr_lab::models::pointnetlk::PointNetLkConfig;
 use upcr_lab::models::prnet::{PrnetConfig, Sampler};
-use upcr_lab::models::weights::TensorFile;
+use upcr_lab::models::tensor_file::TensorFile;
 use upcr_lab::models::{Learned, LearnedConfig};
 use upcr_lab::random;
 use upcr_lab::train::{Event, Length, Poses, Stage, Trainer, TrainingConfig, Validation, Watcher, validate};
@@ -39,7 +39,7 @@ fn others() -> [LearnedConfig; 3] {
     let attention = TransformerConfig { channels: 16, heads: 2, blocks: 1, inner: 16 };
     [
         LearnedConfig::PointNetLk(PointNetLkConfig { widths: [8, 8, 8, 16, 32], steps: 3 }),
-        LearnedConfig::Dcp(DcpConfig { channels: 16, pointer: Some(attention) }),
+        LearnedConfig::Dcp(DcpConfig { channels: 16, pointer: Some(attention), ..DcpConfig::default() }),
         LearnedConfig::Prnet(PrnetConfig { attention, passes: 2, ..PrnetConfig::default() }),
     ]
 }

@@ -7,7 +7,8 @@ use std::path::Path;
 use burn::module::Param;
 use burn::tensor::{Device, Tensor};
 use upcr::net::{Graph, NetworkConfig};
-use upcr_lab::models::weights::{TensorFile, restore};
+use upcr_lab::models::tensor_file::TensorFile;
+use upcr_lab::models::weights::restore;
 use upcr_lab::models::{CloudInput, Clouds, NormalizedLayer, Statistics};
 
 fn golden(name: &str) -> TensorFile {

@@ -10,15 +10,17 @@ use upcr::Result;
 
 use super::attention::{Transformer, TransformerConfig};
 use super::dense::BatchStatistics;
-use super::dgcnn::{Dgcnn, Edges};
+use super::dgcnn::{DEFAULT_K, Dgcnn, Edges, check_k};
 use super::layers::{Init, Statistics, check_channels};
-use super::learned::Truth;
 use super::procrustes;
+use super::truth::Truth;
 
 /// A DCP network. The default is the paper's DCP-v2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DcpConfig {
+    /// Neighbours of a point, itself included.
+    pub k: usize,
     /// Channels of a point's feature.
     pub channels: usize,
     /// The transformer of DCP-v2; DCP-v1 has none, nor a file that tells none.
@@ -29,7 +31,7 @@ pub struct DcpConfig {
 impl Default for DcpConfig {
     fn default() -> Self {
         let pointer = TransformerConfig { channels: 512, heads: 4, blocks: 1, inner: 1024 };
-        Self { channels: 512, pointer: Some(pointer) }
+        Self { k: DEFAULT_K, channels: 512, pointer: Some(pointer) }
     }
 }
 
@@ -44,6 +46,7 @@ impl DcpConfig {
     /// # Errors
     /// Where a number is out of its range.
     pub fn check(&self) -> Result<()> {
+        check_k(self.k)?;
         check_channels(self.channels)?;
         match &self.pointer {
             Some(pointer) => pointer.check(self.channels),
@@ -94,6 +97,12 @@ pub struct DcpOutput {
 }
 
 impl Dcp {
+    /// The same network with `k` neighbours: among fewer points, fewer reach as far.
+    #[must_use]
+    pub fn seeing(&self, k: usize) -> Self {
+        Self { config: DcpConfig { k, ..self.config.clone() }, ..self.clone() }
+    }
+
     /// From `[pairs, points, 3]` of sources and targets.
     pub fn forward(
         &self,
@@ -104,7 +113,7 @@ impl Dcp {
         let mut found = Vec::new();
         let [pairs, ..] = source_points.dims();
         let clouds = Tensor::cat(vec![source_points.clone(), target_points.clone()], 0);
-        let features = self.emb_nn.forward(&clouds, statistics, &mut found);
+        let features = self.emb_nn.forward(&clouds, self.config.k, statistics, &mut found);
         let (source, target) = (features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs));
         let [source_attended, target_attended] = match &self.pointer {
             Some(pointer) => pointer.forward(&source, &target),

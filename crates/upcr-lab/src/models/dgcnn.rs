@@ -7,17 +7,26 @@ use burn::tensor::activation::{leaky_relu, relu};
 use burn::tensor::{Int, Tensor, TensorData};
 use rand::Rng;
 use upcr::net::Graph;
+use upcr::{Error, Result};
 
 use super::dense::{BatchNorm, BatchStatistics, Dense};
 use super::layers::{Init, Statistics};
 use crate::ops::{BatchGraph, Normalized, NormalizedMap, graph_layer};
 
-/// Neighbours of a point, itself included.
-pub const K: usize = 20;
+/// Neighbours of a point, itself included, as published.
+pub const DEFAULT_K: usize = 20;
 /// Channels after each of the first four layers, which the fifth reads together.
 const WIDTHS: [usize; 4] = [64, 64, 128, 256];
 /// Slope of PRNet's rectifiers for negative values.
 pub(super) const NEGATIVE_SLOPE: f32 = 0.2;
+
+/// Refuses what is no number of neighbours.
+pub(super) fn check_k(k: usize) -> Result<()> {
+    if (1..=255).contains(&k) {
+        return Ok(());
+    }
+    Err(Error::InvalidSetting { name: "k", reason: format!("must be 1 to 255 neighbours, not {k}") })
+}
 
 /// Over which edges the layers look.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,18 +76,19 @@ impl Dgcnn {
         }
     }
 
-    /// `[clouds, points, 3]` → `[clouds, points, channels]`.
+    /// `[clouds, points, 3]` → `[clouds, points, channels]`, with `k` neighbours of each point.
     pub fn forward(
         &self,
         points: &Tensor<3>,
+        k: usize,
         statistics: Statistics,
         found: &mut BatchStatistics,
     ) -> Tensor<3> {
         let [clouds, count, _] = points.dims();
         let rows = points.clone().reshape([clouds * count, 3]);
         let features = match self.edges {
-            Edges::Kept => self.on_kept_edges(rows, [clouds, count], statistics, found),
-            Edges::Dynamic => self.on_dynamic_edges(rows, [clouds, count], statistics, found),
+            Edges::Kept => self.on_kept_edges(rows, [clouds, count], k, statistics, found),
+            Edges::Dynamic => self.on_dynamic_edges(rows, [clouds, count], k, statistics, found),
         };
         let joined = self.bn5.forward(self.conv5.forward(Tensor::cat(features, 1)), statistics, found);
         let joined = match self.edges {
@@ -102,10 +112,11 @@ impl Dgcnn {
         &self,
         points: Tensor<2>,
         [clouds, count]: [usize; 2],
+        k: usize,
         statistics: Statistics,
         found: &mut BatchStatistics,
     ) -> Vec<Tensor<2>> {
-        let graph = graph_of(&points, [clouds, count]);
+        let graph = graph_of(&points, [clouds, count], k);
         let k = graph.k;
         let device = points.device();
         let starts = (0..clouds).flat_map(|cloud| std::iter::repeat_n(cloud * count, count * k));
@@ -131,12 +142,13 @@ impl Dgcnn {
         &self,
         points: Tensor<2>,
         sizes: [usize; 2],
+        k: usize,
         statistics: Statistics,
         found: &mut BatchStatistics,
     ) -> Vec<Tensor<2>> {
         let mut features = points;
         let layers = self.layers().map(|(map, norm)| {
-            let graph = Arc::new(graph_of(&features, sizes));
+            let graph = Arc::new(graph_of(&features, sizes, k));
             let inputs = features.dims()[1];
             // The published map is one of [Fⱼ ; Fᵢ], that of a graph layer of [Fᵢ ; Fⱼ − Fᵢ].
             let weight = map.weight.val().transpose();
@@ -185,13 +197,13 @@ impl Dgcnn {
 
 /// The nearest neighbours of every row among those of its cloud, itself included. Squared distances are computed as the
 /// published code does, from inner products in single precision: where two are nearly equal, its choice is made.
-fn graph_of(rows: &Tensor<2>, [clouds, count]: [usize; 2]) -> BatchGraph {
+fn graph_of(rows: &Tensor<2>, [clouds, count]: [usize; 2], k: usize) -> BatchGraph {
     let channels = rows.dims()[1];
     let x = rows.clone().detach().reshape([clouds, count, channels]);
     let squares = x.clone().square().sum_dim(2);
     let distances_sq = squares.clone() - x.clone().matmul(x.transpose()) * 2.0 + squares.transpose();
     let distances_sq: Vec<f32> = distances_sq.into_data().iter::<f32>().collect();
-    let k = K.min(count);
+    let k = k.min(count);
     let nearest = |row: &[f32]| {
         let mut order: Vec<u32> = (0..count as u32).collect();
         let by_distance = |a: &u32, b: &u32| row[*a as usize].total_cmp(&row[*b as usize]).then(a.cmp(b));

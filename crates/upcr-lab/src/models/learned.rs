@@ -16,8 +16,10 @@ use super::dense::BatchStatistics;
 use super::input::{CloudInput, Clouds};
 use super::pointnetlk::{PointNetLk, PointNetLkConfig};
 use super::prnet::{Prnet, PrnetConfig};
+use super::tensor_file::{TensorFile, malformed};
+use super::truth::Truth;
 use super::upcr::{self as upcr_network, Upcr};
-use super::weights::{self, TensorFile, malformed};
+use super::weights;
 use super::{Statistics, named};
 use crate::data::loader::Example;
 use crate::random;
@@ -101,6 +103,7 @@ impl LearnedConfig {
             Self::Dcp(config) => Self::Dcp(DcpConfig {
                 channels: config.channels / 4,
                 pointer: config.pointer.as_ref().map(narrow),
+                ..config.clone()
             }),
             Self::Prnet(config) => {
                 Self::Prnet(PrnetConfig { attention: narrow(&config.attention), ..config.clone() })
@@ -143,10 +146,14 @@ impl LearnedConfig {
     /// The same, as its inputs see it: with so many neighbours, where the network has a choice.
     #[must_use]
     pub fn with_neighbors(&self, k: Option<usize>) -> Self {
-        match (self, k) {
-            (Self::Upcr(config), Some(k)) => Self::Upcr(NetworkConfig { k, ..config.clone() }),
-            _ => self.clone(),
+        let mut config = self.clone();
+        match (&mut config, k) {
+            (Self::Upcr(config), Some(k)) => config.k = k,
+            (Self::Dcp(config), Some(k)) => config.k = k,
+            (Self::Prnet(config), Some(k)) => config.k = k,
+            (Self::PointNetLk(_), _) | (_, None) => {}
         }
+        config
     }
 
     /// What the network is given of a pair.
@@ -159,7 +166,10 @@ impl LearnedConfig {
                 let (source, target) = (CloudInput::new(&source, config)?, CloudInput::new(&target, config)?);
                 PairInput::Clouds(Box::new((source, target)))
             }
-            _ => PairInput::Points(source, target),
+            Self::Dcp(DcpConfig { k, .. }) | Self::Prnet(PrnetConfig { k, .. }) => {
+                PairInput::Points(source, target, *k)
+            }
+            Self::PointNetLk(_) => PairInput::Points(source, target, 0),
         })
     }
 
@@ -177,8 +187,8 @@ impl LearnedConfig {
 pub enum PairInput {
     /// With neighbours and invariant features.
     Clouds(Box<(CloudInput, CloudInput)>),
-    /// Coordinates alone.
-    Points(Vec<[f32; 3]>, Vec<[f32; 3]>),
+    /// Coordinates alone, and how many neighbours the network is to look at.
+    Points(Vec<[f32; 3]>, Vec<[f32; 3]>, usize),
 }
 
 /// Pairs that are seen together. Sources have one number of points, and targets have.
@@ -192,8 +202,8 @@ pub struct Batch {
 #[derive(Debug, Clone)]
 enum BatchInputs {
     Clouds(Clouds),
-    /// Coordinates of all sources, one after the other, and of all targets.
-    Points([Vec<f32>; 2]),
+    /// Coordinates of all sources, one after the other, and of all targets; neighbours.
+    Points([Vec<f32>; 2], usize),
 }
 
 impl Batch {
@@ -201,10 +211,12 @@ impl Batch {
     pub fn new(pairs: &[PairInput], truths: Vec<Rigid>) -> Self {
         let mut clouds = Vec::new();
         let mut points = [Vec::new(), Vec::new()];
+        let mut neighbors = 0;
         for pair in pairs {
             match pair {
                 PairInput::Clouds(pair) => clouds.push((**pair).clone()),
-                PairInput::Points(source, target) => {
+                PairInput::Points(source, target, k) => {
+                    neighbors = *k;
                     points[0].extend_from_slice(source.as_flattened());
                     points[1].extend_from_slice(target.as_flattened());
                 }
@@ -216,7 +228,7 @@ impl Batch {
                 let k = clouds.iter().map(|(source, target)| source.graph.k.max(target.graph.k)).max();
                 BatchInputs::Clouds(Clouds::new(&clouds, k.unwrap_or(1)))
             }
-            None => BatchInputs::Points(points),
+            None => BatchInputs::Points(points, neighbors),
         };
         Self { inputs, truths }
     }
@@ -229,13 +241,21 @@ impl Batch {
     fn clouds(&self) -> Result<&Clouds> {
         match &self.inputs {
             BatchInputs::Clouds(clouds) => Ok(clouds),
-            BatchInputs::Points(_) => Err(mismatch()),
+            BatchInputs::Points(..) => Err(mismatch()),
+        }
+    }
+
+    /// How many neighbours the network is to look at.
+    fn neighbors(&self) -> Result<usize> {
+        match self.inputs {
+            BatchInputs::Points(_, k) => Ok(k),
+            BatchInputs::Clouds(_) => Err(mismatch()),
         }
     }
 
     /// Sources and targets, `[pairs, points, 3]`.
     fn points(&self, device: &Device) -> Result<[Tensor<3>; 2]> {
-        let BatchInputs::Points(points) = &self.inputs else { return Err(mismatch()) };
+        let BatchInputs::Points(points, _) = &self.inputs else { return Err(mismatch()) };
         let pairs = self.truths.len();
         Ok(points.each_ref().map(|values| {
             let count = values.len() / (3 * pairs.max(1));
@@ -250,44 +270,6 @@ impl Batch {
 
 fn mismatch() -> Error {
     Error::InvalidSetting { name: "network", reason: "the batch was made for one of another kind".into() }
-}
-
-/// True rotations `[pairs, 3, 3]` and translations `[pairs, 3]`.
-#[derive(Debug, Clone)]
-pub struct Truth {
-    /// From source to target.
-    pub rotation: Tensor<3>,
-    /// From source to target.
-    pub translation: Tensor<2>,
-}
-
-impl Truth {
-    /// No motion.
-    pub fn identity(pairs: usize, device: &Device) -> Self {
-        Self::of(&vec![Rigid::identity(); pairs], device)
-    }
-
-    /// How far poses are from it: the mean square of the entries of RᵀR' − I and of t − t', as DCP and PRNet learn.
-    pub fn distance(&self, rotation: &Tensor<3>, translation: &Tensor<2>) -> Tensor<1> {
-        let turn = rotation.clone().transpose().matmul(self.rotation.clone());
-        let identity = Tensor::<2>::eye(3, &turn.device()).unsqueeze::<3>();
-        (turn - identity).square().mean() + (translation.clone() - self.translation.clone()).square().mean()
-    }
-
-    fn of(poses: &[Rigid], device: &Device) -> Self {
-        let pairs = poses.len();
-        let rotations =
-            poses.iter().flat_map(|pose| pose.rotation.transpose().iter().copied().collect::<Vec<_>>());
-        let rotations: Vec<f32> = rotations.map(|v| v as f32).collect();
-        let translations: Vec<f32> = poses
-            .iter()
-            .flat_map(|pose| pose.translation.iter().map(|&v| v as f32).collect::<Vec<_>>())
-            .collect();
-        Self {
-            rotation: Tensor::from_data(TensorData::new(rotations, [pairs, 3, 3]), device),
-            translation: Tensor::from_data(TensorData::new(translations, [pairs, 3]), device),
-        }
-    }
 }
 
 /// A network that learns.
@@ -330,11 +312,12 @@ impl Learned {
             }
             Self::Dcp(network) => {
                 let [source, target] = batch.points(&device)?;
-                let output = network.forward(&source, &target, Statistics::Batch);
+                let output = network.seeing(batch.neighbors()?).forward(&source, &target, Statistics::Batch);
                 (output.loss(&batch.truth(&device)), output.statistics)
             }
             Self::Prnet(network) => {
                 let [source, target] = batch.points(&device)?;
+                let network = network.seeing(batch.neighbors()?);
                 network.learn(&source, &target, &batch.truth(&device), &mut random::stream(seed, 0))
             }
             Self::PointNetLk(network) => {
@@ -361,11 +344,13 @@ impl Learned {
             }
             Self::Dcp(network) => {
                 let [source, target] = batch.points(&device)?;
+                let network = network.seeing(batch.neighbors()?);
                 let output = network.forward(&source, &target, Statistics::Running);
                 (poses(&output.rotation, &output.translation), scalar(output.loss(&batch.truth(&device))))
             }
             Self::Prnet(network) => {
                 let [source, target] = batch.points(&device)?;
+                let network = network.seeing(batch.neighbors()?);
                 let (rotation, translation) = network.forward(&source, &target);
                 let loss = batch.truth(&device).distance(&rotation, &translation);
                 (poses(&rotation, &translation), scalar(loss))
@@ -436,7 +421,7 @@ impl Learned {
                 LearnedConfig::Prnet(PrnetConfig { attention, ..PrnetConfig::default() })
             } else {
                 let pointer = begins("pointer.").then(|| transformer("pointer", channels)).transpose()?;
-                LearnedConfig::Dcp(DcpConfig { channels, pointer })
+                LearnedConfig::Dcp(DcpConfig { channels, pointer, ..DcpConfig::default() })
             }
         };
         named::filled(config.init(0, device)?, file, path, str::to_owned)

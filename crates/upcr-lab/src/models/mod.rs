@@ -13,6 +13,8 @@ pub mod prnet;
 mod procrustes;
 pub mod pytorch;
 mod rotation;
+pub mod tensor_file;
+pub mod truth;
 pub mod upcr;
 pub mod weights;
 

@@ -7,7 +7,7 @@ use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Tensor, TensorData};
 use upcr::{Error, Result};
 
-use super::weights::{StoredTensor, TensorFile, malformed};
+use super::tensor_file::{StoredTensor, TensorFile, malformed};
 
 /// All tensors of a module.
 pub fn tensors(module: &impl Module) -> BTreeMap<String, StoredTensor> {

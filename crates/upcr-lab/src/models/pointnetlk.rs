@@ -10,8 +10,8 @@ use upcr::{Error, Result};
 
 use super::dense::{BatchNorm, BatchStatistics, Dense};
 use super::layers::{Init, Statistics, check_channels};
-use super::learned::Truth;
 use super::procrustes::cross_matrix;
+use super::truth::Truth;
 
 /// A PointNetLK network. The default is the paper's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -11,9 +11,9 @@ use upcr::{Error, Result};
 use super::attention::{Transformer, TransformerConfig};
 use super::dcp::{likeness, pose_of_matches};
 use super::dense::{BatchNorm, BatchStatistics, Dense};
-use super::dgcnn::{Dgcnn, Edges, NEGATIVE_SLOPE};
+use super::dgcnn::{DEFAULT_K, Dgcnn, Edges, NEGATIVE_SLOPE, check_k};
 use super::layers::{Init, Statistics};
-use super::learned::Truth;
+use super::truth::Truth;
 
 /// Bounds of the temperature's inverse.
 const SHARPEST: f64 = 100.0;
@@ -29,6 +29,8 @@ const INNER: usize = 128;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PrnetConfig {
+    /// Neighbours of a point, itself included.
+    pub k: usize,
     /// The transformer, and channels of a point's feature.
     pub attention: TransformerConfig,
     /// Share of each cloud's points that are matched; 1 in PRNet*.
@@ -53,7 +55,7 @@ pub enum Sampler {
 impl Default for PrnetConfig {
     fn default() -> Self {
         let attention = TransformerConfig { channels: 512, heads: 4, blocks: 1, inner: 1024 };
-        Self { attention, keypoints: 0.5, passes: 3, sampler: Sampler::default() }
+        Self { k: DEFAULT_K, attention, keypoints: 0.5, passes: 3, sampler: Sampler::default() }
     }
 }
 
@@ -63,6 +65,7 @@ impl PrnetConfig {
     /// # Errors
     /// Where a number is out of its range.
     pub fn check(&self) -> Result<()> {
+        check_k(self.k)?;
         self.attention.check(self.attention.channels)?;
         let refused = |name, reason: &str| Err(Error::InvalidSetting { name, reason: reason.into() });
         if !(self.keypoints > 0.0 && self.keypoints <= 1.0) {
@@ -128,6 +131,12 @@ pub struct PrnetOutput {
 }
 
 impl Prnet {
+    /// The same network with `k` neighbours: among fewer points, fewer reach as far.
+    #[must_use]
+    pub fn seeing(&self, k: usize) -> Self {
+        Self { config: PrnetConfig { k, ..self.config.clone() }, ..self.clone() }
+    }
+
     /// One pass, from `[pairs, points, 3]` of sources and targets. Where partners are drawn, `random` draws them; without
     /// it they are the most alike.
     pub fn pass(
@@ -140,7 +149,7 @@ impl Prnet {
         let mut found = Vec::new();
         let [pairs, ..] = source_points.dims();
         let clouds = Tensor::cat(vec![source_points.clone(), target_points.clone()], 0);
-        let features = self.emb_nn.forward(&clouds, statistics, &mut found);
+        let features = self.emb_nn.forward(&clouds, self.config.k, statistics, &mut found);
         let (source, target) = (features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs));
         let [source_gain, target_gain] = self.attention.forward(&source, &target);
         let (source, target) = (source + source_gain, target + target_gain);

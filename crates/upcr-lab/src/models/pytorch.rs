@@ -6,7 +6,7 @@ use pytorch_reader::{DType, PytorchError, PytorchReader};
 use safetensors::tensor::Dtype;
 use upcr::{Error, Result};
 
-use super::weights::{StoredTensor, TensorFile};
+use super::tensor_file::{StoredTensor, TensorFile};
 
 /// The tensors of a file. Counters and the like, which are not single precision, keep their type.
 ///

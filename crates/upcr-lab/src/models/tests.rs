@@ -10,7 +10,7 @@ use super::attention::TransformerConfig;
 use super::dcp::{DcpConfig, pose_of_matches};
 use super::pointnetlk::PointNetLkConfig;
 use super::prnet::{PrnetConfig, Sampler};
-use super::weights::{StoredTensor, TensorFile};
+use super::tensor_file::{StoredTensor, TensorFile};
 use super::{Statistics, named, procrustes};
 use crate::random;
 
@@ -114,7 +114,8 @@ fn clouds(pairs: usize, points: usize) -> [Tensor<3>; 2] {
 fn gradients_of_dcp_are_slopes() {
     let [source, target] = clouds(2, 24);
     for pointer in [None, Some(TRANSFORMER)] {
-        let network = DcpConfig { channels: 16, pointer }.init(&mut random::stream(1, 0), &device());
+        let network = DcpConfig { channels: 16, pointer, ..DcpConfig::default() }
+            .init(&mut random::stream(1, 0), &device());
         assert_gradients(&network, |network| {
             let output = network.forward(&source, &target, Statistics::Batch);
             pose_loss(output.rotation, output.translation)
@@ -126,7 +127,13 @@ fn gradients_of_dcp_are_slopes() {
 fn gradients_of_prnet_are_slopes() {
     // So few points that all are neighbours: which ones are has no gradient.
     let [source, target] = clouds(6, 18);
-    let config = PrnetConfig { attention: TRANSFORMER, keypoints: 1.0, passes: 1, sampler: Sampler::Softmax };
+    let config = PrnetConfig {
+        attention: TRANSFORMER,
+        keypoints: 1.0,
+        passes: 1,
+        sampler: Sampler::Softmax,
+        ..PrnetConfig::default()
+    };
     let network = config.init(&mut random::stream(1, 0), &device());
     // Sharp enough for the rotations to be determined, and within the bounds, where it has a gradient.
     let mut file = TensorFile { tensors: named::tensors(&network), ..TensorFile::default() };
@@ -206,7 +213,13 @@ fn matches_without_shape_have_finite_gradients() {
 
 #[test]
 fn networks_come_back_from_their_files() {
-    let config = PrnetConfig { attention: TRANSFORMER, keypoints: 0.5, passes: 1, sampler: Sampler::Softmax };
+    let config = PrnetConfig {
+        attention: TRANSFORMER,
+        keypoints: 0.5,
+        passes: 1,
+        sampler: Sampler::Softmax,
+        ..PrnetConfig::default()
+    };
     let network = config.init(&mut random::stream(1, 0), &Device::flex());
     let mut file = TensorFile { tensors: named::tensors(&network), ..TensorFile::default() };
     for name in [

@@ -15,30 +15,9 @@ use super::batch::BatchGraph;
 use super::canonical_chamfer::PairPoints;
 use super::edge_embed::EdgeInputs;
 use super::graph_layer::{EdgeStatistics, Parameters};
+use super::normalized::{Normalized, NormalizedMap};
 use super::{canonical_chamfer as chamfer_kernel, edge_embed as embed_kernel, generic};
 use super::{graph_layer as layer_kernel, pool as pool_kernel};
-
-/// Parameters of a map followed by batch norm over edges.
-#[derive(Debug, Clone)]
-pub struct NormalizedMap {
-    /// `[inputs, outputs]`.
-    pub weight: Tensor<2>,
-    /// Scale of the norm, `[outputs]`.
-    pub gamma: Tensor<1>,
-    /// Shift of the norm, `[outputs]`.
-    pub beta: Tensor<1>,
-    /// Slope of the leaky rectifier for negative values.
-    pub negative_slope: f32,
-}
-
-/// Values of a layer, and the statistics over edges that normalised them (no gradient flows through these).
-#[derive(Debug, Clone)]
-pub struct Normalized {
-    /// `[rows, outputs]`.
-    pub values: Tensor<2>,
-    /// Mean and variance, `[outputs]` each.
-    pub statistics: [Tensor<1>; 2],
-}
 
 /// A graph layer on `features` `[rows, inputs]`; the map's weight is `[2 · inputs, outputs]`. Without `statistics`, the
 /// batch's own normalise.

@@ -11,8 +11,8 @@ use burn::tensor::{Device, Int, Tensor, TensorData};
 use super::batch::BatchGraph;
 use super::canonical_chamfer::PairPoints;
 use super::edge_embed::EdgeInputs;
-use super::extension::{Normalized, NormalizedMap};
 use super::graph_layer::EPSILON;
+use super::normalized::{Normalized, NormalizedMap};
 
 /// Rows of the edges' neighbours, counted over the batch.
 fn neighbor_rows(graph: &BatchGraph, device: &Device) -> Tensor<1, Int> {

@@ -11,11 +11,13 @@ pub mod edge_embed;
 mod extension;
 mod generic;
 pub mod graph_layer;
+mod normalized;
 pub mod pool;
 mod product;
 
 pub use batch::BatchGraph;
-pub use extension::{Normalized, NormalizedMap, canonical_chamfer, edge_embed, graph_layer, pool_max};
+pub use extension::{canonical_chamfer, edge_embed, graph_layer, pool_max};
+pub use normalized::{Normalized, NormalizedMap};
 
 #[cfg(test)]
 mod tests;

@@ -11,7 +11,7 @@ use upcr::net::{Graph, Invariant, InvariantInputs};
 
 use super::canonical_chamfer::PairPoints;
 use super::edge_embed::EdgeInputs;
-use super::extension::{Normalized, NormalizedMap};
+use super::normalized::{Normalized, NormalizedMap};
 use super::{BatchGraph, extension, generic};
 use crate::random;
 

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use upcr::Result;
 
 use super::config::{Decay, Length, Stage, TrainingConfig};
-use super::history::{ValidationErrors, Watcher, write_history};
+use super::history::{ValidationErrors, Watcher};
+use super::plot::write_history;
 use super::trainer::{Poses, Trainer, Validation, validate};
 use crate::data::Shapes;
 use crate::data::pairs::Mixture;

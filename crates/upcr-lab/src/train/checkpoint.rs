@@ -13,7 +13,7 @@ use super::config::TrainingConfig;
 use super::history::History;
 use crate::files::write_atomically;
 use crate::models::Learned;
-use crate::models::weights::{StoredTensor, TensorFile};
+use crate::models::tensor_file::{StoredTensor, TensorFile};
 
 const OPTIMIZER: &str = "optimizer";
 const STATE_KEY: &str = "upcr.training";

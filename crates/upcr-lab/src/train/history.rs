@@ -1,14 +1,8 @@
 //! What a run tells while it goes, and keeps.
 
-use std::fmt::Write;
-use std::path::Path;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use upcr::Result;
-
-use super::plot::learning_curve;
-use crate::files::write_atomically;
 
 /// Errors on pairs that no gradient came from, whose true poses are known.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -53,28 +47,6 @@ impl Event {
 
 /// The learning curve.
 pub type History = Vec<Event>;
-
-/// Writes the curve into a run's folder: `history.csv`, and `history.svg` as a picture.
-///
-/// # Errors
-/// Where a file cannot be written.
-pub fn write_history(folder: &Path, history: &[Event]) -> Result<()> {
-    let mut csv = String::from(
-        "step,points,seconds,learning_rate,clouds_per_second,loss,val_loss,val_mae_r_deg,val_mae_t,val_recall\n",
-    );
-    for e in history {
-        let [loss, mae_r, mae_t, recall] =
-            e.validation.map_or([f64::NAN; 4], |v| [v.loss, v.mae_r_deg, v.mae_t, v.recall]);
-        // Writing to a string cannot fail.
-        let _ = writeln!(
-            csv,
-            "{},{},{:.1},{:e},{:.1},{},{loss},{mae_r},{mae_t},{recall}",
-            e.step, e.points, e.seconds, e.learning_rate, e.clouds_per_second, e.loss
-        );
-    }
-    write_atomically(&folder.join("history.csv"), csv.as_bytes())?;
-    write_atomically(&folder.join("history.svg"), learning_curve(history)?.as_bytes())
-}
 
 /// Someone who is told of a run's progress and may end it.
 pub trait Watcher {

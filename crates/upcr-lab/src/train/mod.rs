@@ -9,6 +9,6 @@ mod trainer;
 
 pub use adapt::{Adaptation, adapt};
 pub use config::{Decay, Length, Stage, TrainingConfig};
-pub use history::{Event, History, Silent, ValidationErrors, Watcher, write_history};
-pub use plot::learning_curve;
+pub use history::{Event, History, Silent, ValidationErrors, Watcher};
+pub use plot::{learning_curve, write_history};
 pub use trainer::{Poses, Trainer, Validation, validate};

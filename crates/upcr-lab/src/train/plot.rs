@@ -1,4 +1,7 @@
-//! The learning curve as a picture.
+//! The learning curve as a table and as a picture.
+
+use std::fmt::Write;
+use std::path::Path;
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
@@ -6,6 +9,7 @@ use plotters::style::RGBColor;
 use upcr::{Error, Result};
 
 use super::history::Event;
+use crate::files::write_atomically;
 
 /// Colours that the colour-blind can tell apart (Okabe and Ito).
 const BLUE: RGBColor = RGBColor(0, 114, 178);
@@ -79,6 +83,28 @@ fn panel(area: &Panel, title: &str, lines: &[Line]) -> std::result::Result<(), B
     }
     chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw()?;
     Ok(())
+}
+
+/// Writes the curve into a run's folder: `history.csv`, and `history.svg` as a picture.
+///
+/// # Errors
+/// Where a file cannot be written.
+pub fn write_history(folder: &Path, history: &[Event]) -> Result<()> {
+    let mut csv = String::from(
+        "step,points,seconds,learning_rate,clouds_per_second,loss,val_loss,val_mae_r_deg,val_mae_t,val_recall\n",
+    );
+    for e in history {
+        let [loss, mae_r, mae_t, recall] =
+            e.validation.map_or([f64::NAN; 4], |v| [v.loss, v.mae_r_deg, v.mae_t, v.recall]);
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            csv,
+            "{},{},{:.1},{:e},{:.1},{},{loss},{mae_r},{mae_t},{recall}",
+            e.step, e.points, e.seconds, e.learning_rate, e.clouds_per_second, e.loss
+        );
+    }
+    write_atomically(&folder.join("history.csv"), csv.as_bytes())?;
+    write_atomically(&folder.join("history.svg"), learning_curve(history)?.as_bytes())
 }
 
 #[cfg(test)]

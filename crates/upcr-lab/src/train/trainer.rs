@@ -16,7 +16,7 @@ pub use crate::data::loader::Poses;
 use crate::data::loader::{Example, Loader, Plan, Position, Training};
 use crate::data::pairs::Mixture;
 use crate::eval::metrics::{PoseErrors, Recall, Tolerance};
-use crate::models::weights::TensorFile;
+use crate::models::tensor_file::TensorFile;
 use crate::models::{Batch, Learned, LearnedConfig};
 use crate::random;
 

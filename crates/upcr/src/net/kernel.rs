@@ -7,32 +7,9 @@ use multiversion::{multiversion, target::target_cfg_f};
 
 use super::Graph;
 use super::graph::PairedRows;
+use super::lanes::{BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE};
 #[cfg(target_arch = "x86_64")]
 use super::simd;
-
-/// Channels that are worked on together: their products over a cloud stay in cache until they are gathered.
-pub(super) const BLOCK: usize = 32;
-/// Points that are multiplied together.
-pub(super) const TILE: usize = 6;
-
-/// One value of a block's channels each.
-pub(super) type Lanes = [f32; BLOCK];
-
-/// Four values of a row, in bytes.
-pub(super) type Quad = [u8; 4];
-/// Four weights of each channel, of a block's two products one after the other.
-pub(super) type QuadLanes = [[i8; 4]; 2 * BLOCK];
-/// Inner products of quads.
-pub(super) type Sums = [i32; 2 * BLOCK];
-/// Upper bounds of a block's products or values.
-pub(super) type Bounds = [i16; BLOCK];
-
-/// A point, and a bit for each channel of a block.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Hit {
-    pub point: u32,
-    pub channels: u32,
-}
 
 /// A row is brought into cache when the one so many before it is written: stores that wait for their lines one by one
 /// took a quarter of the time of [`gather`].
@@ -40,11 +17,6 @@ const AHEAD: usize = 8;
 
 /// Whether every processor that this is built for multiplies and adds in one step.
 const FUSED: bool = cfg!(any(target_feature = "fma", target_arch = "aarch64"));
-
-/// The number of rows that hold `points` in whole tiles.
-pub(super) fn whole_tiles(points: usize) -> usize {
-    points.next_multiple_of(TILE)
-}
 
 /// `out[i] = init + Σₖ rows[i·stride + k] · panel[k]`, for whole tiles of rows.
 pub(super) fn multiply(rows: &[f32], stride: usize, panel: &[Lanes], init: &Lanes, out: &mut [Lanes]) {

@@ -6,7 +6,8 @@
 
 use super::aligned::Aligned;
 use super::graph::PairedRows;
-use super::kernel::{self, BLOCK, Lanes, whole_tiles};
+use super::kernel;
+use super::lanes::{BLOCK, Lanes, whole_tiles};
 use super::weights::Affine;
 use super::{Graph, InvariantInputs};
 

@@ -6,6 +6,7 @@ mod graph;
 mod head;
 mod invariant;
 mod kernel;
+mod lanes;
 mod layer;
 mod network;
 mod pool;

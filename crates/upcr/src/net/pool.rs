@@ -11,10 +11,8 @@ use multiversion::multiversion;
 use super::Graph;
 use super::aligned::Aligned;
 use super::graph::PairedRows;
-use super::kernel::{
-    self, BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE, dot, larger, leaky, places, prefetch,
-    whole_tiles,
-};
+use super::kernel::{self, dot, larger, leaky, places, prefetch};
+use super::lanes::{BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE, whole_tiles};
 use super::layer::{Features, blocks};
 use super::weights::Affine;
 

@@ -4,7 +4,8 @@ use multiversion::{multiversion, target::match_target};
 
 use super::Graph;
 use super::aligned::Aligned;
-use super::kernel::{self, BLOCK, Lanes, places, whole_tiles};
+use super::kernel::{self, places};
+use super::lanes::{BLOCK, Lanes, whole_tiles};
 use super::layer::Features;
 #[cfg(target_arch = "x86_64")]
 use super::simd;

@@ -4,7 +4,7 @@
 #[allow(clippy::wildcard_imports)]
 use std::arch::x86_64::*;
 
-use super::kernel::{BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE};
+use super::lanes::{BLOCK, Bounds, Hit, Lanes, Quad, QuadLanes, Sums, TILE};
 
 /// [`multiply`](super::kernel::multiply) in vectors of 16.
 #[target_feature(enable = "avx512f")]
