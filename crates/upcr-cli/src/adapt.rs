@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use upcr_lab::data::{self, Split, pairs::POINTS};
 use upcr_lab::files::write_atomically;
@@ -20,7 +20,8 @@ const AFTER_HELP: &str = "\
 Files in the output folder:
   weights.safetensors      the adapted weights, or the old ones where adapting did not help
   adaptation.json          loss before and after, settings, seed and version
-  checkpoint.safetensors   the state of the run, written every minute";
+  checkpoint.safetensors   the state of the run, written every minute; the same command goes on from there
+  history.csv, history.svg the learning curve";
 
 /// Let learned weights learn on from your own clouds, without labels
 #[derive(clap::Args)]
@@ -45,7 +46,7 @@ pub struct Args {
     #[arg(long)]
     fixed_pairs: bool,
     /// Passes over the clouds
-    #[arg(long, value_name = "N", default_value_t = 200)]
+    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..))]
     epochs: u64,
     /// Points of a cloud
     #[arg(long, value_name = "N", default_value_t = POINTS)]
@@ -96,6 +97,10 @@ fn learn(args: &Args) -> Result<ExitCode> {
     let bytes = std::fs::read(&args.weights).with_context(|| args.weights.display().to_string())?;
     let file = TensorFile::from_bytes(&bytes, &args.weights)?;
     let network = Learned::restore(&file, &args.weights, &args.backend.device().autodiff())?;
+    if !matches!(network, Learned::Upcr(_)) {
+        let path = args.weights.display();
+        bail!("{path}: only UPCR's weights learn without labels; others are trained by `upcr train`");
+    }
     let shapes = Arc::new(data::open(&args.clouds, args.split.into())?);
     output::note(&format!("{} clouds to learn from", shapes.len()));
     std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
@@ -121,6 +126,9 @@ fn learn(args: &Args) -> Result<ExitCode> {
     });
     let report = serde_json::to_string_pretty(&report)?;
     write_atomically(&args.out.join("adaptation.json"), report.as_bytes())?;
+    if !done.finished {
+        output::note("stopped early; the same command goes on");
+    }
     output::note(&format!(
         "loss {:.6} before, {:.6} after: {}",
         before.loss,

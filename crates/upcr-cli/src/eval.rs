@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use upcr::{Settings, net::Network};
 use upcr_lab::data::Split;
@@ -42,7 +42,7 @@ pub struct Args {
     outliers: f64,
     /// Pairs at most, the first ones [default: all]
     #[arg(long, value_name = "N")]
-    pairs: Option<usize>,
+    pairs: Option<std::num::NonZeroUsize>,
     /// Threads to use [default: all]; only times depend on it
     #[arg(long, value_name = "N")]
     threads: Option<std::num::NonZeroUsize>,
@@ -79,7 +79,11 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 
 /// `NAME`, or `NAME=WEIGHTS`.
 fn evaluated(method: &str) -> Result<EvaluatedMethod> {
+    let method = method.trim();
     let Some((name, path)) = method.split_once('=') else { return Ok(EvaluatedMethod::by_name(method)?) };
+    if name.is_empty() {
+        bail!("--methods {method}: a name is wanted before the weights");
+    }
     let path = Path::new(path);
     #[cfg(feature = "train")]
     {
@@ -96,6 +100,9 @@ fn evaluated(method: &str) -> Result<EvaluatedMethod> {
 fn compare(args: &Args) -> Result<ExitCode> {
     if let Some(path) = &args.out {
         output::check_folder(path)?;
+        if path.extension().is_some_and(|extension| extension == "csv") {
+            bail!("{}: --out names the JSON file; the CSV file comes beside it", path.display());
+        }
     }
     let methods: Vec<EvaluatedMethod> =
         args.methods.iter().map(|method| evaluated(method)).collect::<Result<_>>()?;
@@ -109,7 +116,7 @@ fn compare(args: &Args) -> Result<ExitCode> {
         let name = pairs.to_possible_value().map_or(String::new(), |value| value.get_name().to_owned());
         progress.step("reading");
         let mut shapes = pairs.shapes(&args.data, Split::Test)?;
-        shapes.truncate(args.pairs.unwrap_or(usize::MAX));
+        shapes.truncate(args.pairs.map_or(usize::MAX, std::num::NonZeroUsize::get));
         for overlap in &args.overlap {
             let mut protocol = overlap.protocol().with_outliers(args.outliers);
             if *pairs == Pairs::Nd {
@@ -141,7 +148,7 @@ fn compare(args: &Args) -> Result<ExitCode> {
             },
         });
         let text = serde_json::to_string_pretty(&report)?;
-        write_atomically(path, text.as_bytes()).with_context(|| path.display().to_string())?;
+        write_atomically(path, text.as_bytes())?;
         write_atomically(&path.with_extension("csv"), csv(&rows).as_bytes())?;
     }
     output::answer(&markdown(&rows))?;

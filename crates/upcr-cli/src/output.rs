@@ -31,8 +31,11 @@ pub fn answer_json_line(value: &impl Serialize) -> anyhow::Result<()> {
     answer(&text)
 }
 
-/// Refuses an output file whose folder does not exist, before long work and not after it.
+/// Refuses an output file whose folder does not exist or that is one, before long work and not after it.
 pub fn check_folder(path: &Path) -> anyhow::Result<()> {
+    if path.is_dir() {
+        bail!("{}: a folder, where a file is wanted", path.display());
+    }
     match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() && !folder.is_dir() => {
             bail!("{}: there is no folder {}", path.display(), folder.display())

@@ -167,6 +167,9 @@ fn start(args: &Args, device: &upcr_lab::Device) -> Result<(PathBuf, Run, Traine
     if folder.join("checkpoint.safetensors").exists() {
         bail!("{0} holds a run already; go on with it by --resume {0}", folder.display());
     }
+    if let Some(missing) = args.data.iter().find(|path| !path.exists()) {
+        bail!("{}: there is no such file or folder", missing.display());
+    }
     std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
     let trainer = Trainer::new(training.clone(), &folder, device)?;
     let run = Run {

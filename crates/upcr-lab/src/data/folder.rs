@@ -1,7 +1,7 @@
 //! A folder of clouds or meshes, in any of the library's formats, as shapes of one category.
 //!
-//! Files are taken in the order of their names; folders inside are not looked into, and poses (`*.pose.txt`) are left
-//! out. Of five shapes the last is for tests.
+//! Files are taken in the order of their names; folders inside are not looked into, and poses (`*.pose.txt`,
+//! `T_*.txt`) are left out. Of five shapes the last is for tests.
 
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
@@ -46,7 +46,10 @@ fn read_shape(path: &Path, index: usize) -> Result<Vec<[f32; 3]>> {
 fn files(folder: &Path) -> Result<Vec<PathBuf>> {
     let list = || -> std::io::Result<Vec<PathBuf>> {
         let paths = folder.read_dir()?.map(|entry| Ok(entry?.path())).collect::<std::io::Result<Vec<_>>>()?;
-        let is_pose = |path: &Path| path.to_string_lossy().ends_with(".pose.txt");
+        let is_pose = |path: &Path| {
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            name.ends_with(".pose.txt") || (name.starts_with("T_") && name.ends_with(".txt"))
+        };
         let is_cloud = |path: &PathBuf| path.is_file() && io::format_name(path).is_some() && !is_pose(path);
         let mut files: Vec<PathBuf> = paths.into_iter().filter(is_cloud).collect();
         files.sort();
@@ -73,7 +76,9 @@ mod tests {
             let name = format!("{i}.{}", ["ply", "xyz", "pcd"][i as usize % 3]);
             io::write_cloud(at(&name), &PointCloud::from_points(points)).unwrap();
         }
-        std::fs::write(at("0.pose.txt"), "no cloud").unwrap();
+        for pose in ["0.pose.txt", "T_0_1.txt"] {
+            std::fs::write(at(pose), "no cloud").unwrap();
+        }
         std::fs::create_dir(at("7.ply")).unwrap();
         let sizes = |split| -> Vec<usize> {
             data::open(folder.path(), split).unwrap().clouds.iter().map(Vec::len).collect()

@@ -245,7 +245,9 @@ impl Trainer {
                     steps: place.steps,
                     points: place.stage.points,
                     loss: since.loss / since.steps as f64,
-                    validation: validates.then(|| validate(&self.network, validation)).transpose()?,
+                    validation: (validates && !validation.batches.is_empty())
+                        .then(|| validate(&self.network, validation))
+                        .transpose()?,
                     learning_rate: rate,
                     clouds_per_second: (since.steps * 2 * place.stage.batch) as f64 / since.seconds,
                     seconds: self.state.seconds,

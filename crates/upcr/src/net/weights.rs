@@ -9,6 +9,8 @@ use crate::error::{Error, Result};
 const EPSILON: f64 = 1e-5;
 /// Metadata of a weights file.
 const CONFIG_KEY: &str = "upcr.config";
+/// Under it other networks that are trained here have their configuration.
+const OTHER_KEY: &str = "upcr.network";
 const TRAINED_KEY: &str = "upcr.trained";
 
 /// An opened weights file. Tensors beside those that the network asks for are no error.
@@ -40,8 +42,12 @@ impl<'a> Weights<'a> {
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(unreadable)?;
         let tensors = SafeTensors::deserialize(bytes).map_err(unreadable)?;
         let entry = |key| header.metadata().as_ref().and_then(|entries| entries.get(key));
-        let config =
-            entry(CONFIG_KEY).ok_or_else(|| invalid(format!("no `{CONFIG_KEY}` in its metadata")))?;
+        let config = entry(CONFIG_KEY).ok_or_else(|| {
+            invalid(match entry(OTHER_KEY) {
+                Some(other) => format!("weights of another network than UPCR's, {other}"),
+                None => format!("no `{CONFIG_KEY}` in its metadata"),
+            })
+        })?;
         let config: NetworkConfig =
             serde_json::from_str(config).map_err(|e| invalid(format!("`{CONFIG_KEY}`: {e}")))?;
         config.check()?;
