@@ -31,7 +31,7 @@ fn main() {
         (0..points).map(|_| random::direction(&mut rng).map(|v| v as f32).into()).collect()
     };
     let inputs: Vec<_> = (0..pairs).map(|_| config.network.input(cloud(), cloud()).unwrap()).collect();
-    let batch = Batch::new(&inputs, vec![Rigid::identity(); pairs]);
+    let batch = Batch::new(inputs, vec![Rigid::identity(); pairs]);
     let folder = std::env::temp_dir();
     let mut trainer = Trainer::new(config, &folder, &Device::flex()).unwrap();
     let mut times_ms: Vec<f64> = (0..=repeats)

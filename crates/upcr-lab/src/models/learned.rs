@@ -208,15 +208,15 @@ enum BatchInputs {
 
 impl Batch {
     /// Joins pairs, all made for one network, with their true motions.
-    pub fn new(pairs: &[PairInput], truths: Vec<Rigid>) -> Self {
+    pub fn new(pairs: Vec<PairInput>, truths: Vec<Rigid>) -> Self {
         let mut clouds = Vec::new();
         let mut points = [Vec::new(), Vec::new()];
         let mut neighbors = 0;
         for pair in pairs {
             match pair {
-                PairInput::Clouds(pair) => clouds.push((**pair).clone()),
+                PairInput::Clouds(pair) => clouds.push(*pair),
                 PairInput::Points(source, target, k) => {
-                    neighbors = *k;
+                    neighbors = k;
                     points[0].extend_from_slice(source.as_flattened());
                     points[1].extend_from_slice(target.as_flattened());
                 }
@@ -433,7 +433,7 @@ impl Learned {
     /// Where the invariant feature cannot be computed.
     pub fn predict(&self, source: Vec<[f32; 3]>, target: Vec<[f32; 3]>) -> Result<Rigid> {
         let input = self.config().input(source, target)?;
-        let (poses, _) = self.judge(&Batch::new(&[input], vec![Rigid::identity()]))?;
+        let (poses, _) = self.judge(&Batch::new(vec![input], vec![Rigid::identity()]))?;
         Ok(poses.first().copied().unwrap_or_else(Rigid::identity))
     }
 

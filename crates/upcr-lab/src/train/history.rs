@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 /// Errors on pairs that no gradient came from, whose true poses are known.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ValidationErrors {
-    /// Mean Chamfer distance between canonical shapes.
+    /// Mean loss: of UPCR the Chamfer distance between canonical shapes.
     pub loss: f64,
     /// Mean absolute error of the Euler angles, in degrees.
     pub mae_r_deg: f64,

@@ -1,4 +1,4 @@
-//! Training without labels: the loop, what it keeps, and how it goes on after a stop.
+//! Training: the loop, what it keeps, and how it goes on after a stop.
 
 mod adapt;
 mod checkpoint;

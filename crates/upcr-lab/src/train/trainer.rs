@@ -66,7 +66,7 @@ impl Validation {
                     pairs.push(config.input(source, target)?);
                     truths.push(pair.T_target_source);
                 }
-                batches.push(Batch::new(&pairs, truths));
+                batches.push(Batch::new(pairs, truths));
             }
         }
         Ok(Self { batches })
@@ -228,7 +228,7 @@ impl Trainer {
         while self.state.step < place.end {
             let start = Instant::now();
             let Some(batch) = batches.next().transpose()? else { break };
-            let batch = Batch::new(&batch.prepared, batch.T_target_source);
+            let batch = Batch::new(batch.prepared, batch.T_target_source);
             let rate = config.step_size(self.state.step, place.steps);
             let loss = self.step(&batch, rate)?;
             self.state.step += 1;
