@@ -4,7 +4,7 @@ use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 use rand::Rng;
 
-use super::layers::{Init, Statistics};
+use super::layers::{Init, Statistics, towards};
 
 /// A linear map of channels: PyTorch's `Linear`, and its convolutions over single points.
 #[derive(Module, Debug)]
@@ -87,15 +87,17 @@ impl BatchNorm {
         (x - mean) * scale + self.bias.val().unsqueeze()
     }
 
-    /// The norm with its running statistics moved by `share` towards a batch's.
+    /// The norm with its running statistics moved by `share` towards the next of a batch's.
     #[must_use]
-    pub fn observed(mut self, batch: &[Tensor<1>; 2], share: f64) -> Self {
-        let [mean, variance] = batch;
-        let towards = |running: Tensor<1>, batch: &Tensor<1>| {
-            (running * (1.0 - share) + batch.clone() * share).detach()
-        };
-        self.running_mean = self.running_mean.map(|running| towards(running, mean));
-        self.running_var = self.running_var.map(|running| towards(running, variance));
+    pub(super) fn observed<'a>(
+        mut self,
+        batch: &mut impl Iterator<Item = &'a [Tensor<1>; 2]>,
+        share: f64,
+    ) -> Self {
+        if let Some([mean, variance]) = batch.next() {
+            self.running_mean = self.running_mean.map(|running| towards(running, mean, share));
+            self.running_var = self.running_var.map(|running| towards(running, variance, share));
+        }
         self
     }
 }

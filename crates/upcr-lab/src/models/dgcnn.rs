@@ -180,10 +180,7 @@ impl Dgcnn {
         batch: &mut impl Iterator<Item = &'a [Tensor<1>; 2]>,
         share: f64,
     ) -> Self {
-        let mut observe = |norm: BatchNorm| match batch.next() {
-            Some(statistics) => norm.observed(statistics, share),
-            None => norm,
-        };
+        let mut observe = |norm: BatchNorm| norm.observed(batch, share);
         Self {
             bn1: observe(self.bn1),
             bn2: observe(self.bn2),

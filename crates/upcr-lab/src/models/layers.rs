@@ -16,6 +16,11 @@ pub(super) fn check_channels(channels: usize) -> Result<()> {
     Err(Error::InvalidSetting { name: "channels", reason })
 }
 
+/// Running statistics, moved by `share` towards a batch's.
+pub(super) fn towards(running: Tensor<1>, batch: &Tensor<1>, share: f64) -> Tensor<1> {
+    (running * (1.0 - share) + batch.clone() * share).detach()
+}
+
 /// Whose statistics normalise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Statistics {
@@ -119,11 +124,8 @@ impl NormalizedLayer {
     #[must_use]
     pub fn observed(mut self, batch: &[Tensor<1>; 2], share: f64) -> Self {
         let [mean, variance] = batch;
-        let towards = |running: Tensor<1>, batch: &Tensor<1>| {
-            (running * (1.0 - share) + batch.clone() * share).detach()
-        };
-        self.mean = self.mean.map(|running| towards(running, mean));
-        self.var = self.var.map(|running| towards(running, variance));
+        self.mean = self.mean.map(|running| towards(running, mean, share));
+        self.var = self.var.map(|running| towards(running, variance, share));
         self
     }
 }

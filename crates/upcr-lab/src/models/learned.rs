@@ -21,7 +21,6 @@ use super::truth::Truth;
 use super::upcr::{self as upcr_network, Upcr};
 use super::weights;
 use super::{Statistics, named};
-use crate::data::loader::Example;
 use crate::random;
 
 /// Metadata key under which the configurations of networks other than UPCR's stand.
@@ -172,14 +171,6 @@ impl LearnedConfig {
             Self::PointNetLk(_) => PairInput::Points(source, target, 0),
         })
     }
-
-    /// What it is given of a loader's example.
-    ///
-    /// # Errors
-    /// As [`Self::input`].
-    pub fn example(&self, example: &Example) -> Result<PairInput> {
-        self.input(example.source.clone(), example.target.clone())
-    }
 }
 
 /// A pair as a network is given it.
@@ -222,12 +213,10 @@ impl Batch {
                 }
             }
         }
-        let inputs = match clouds.first() {
-            // A cloud with fewer points than neighbours has fewer of these.
-            Some(_) => {
-                let k = clouds.iter().map(|(source, target)| source.graph.k.max(target.graph.k)).max();
-                BatchInputs::Clouds(Clouds::new(&clouds, k.unwrap_or(1)))
-            }
+        // A cloud with fewer points than neighbours has fewer of these.
+        let k = clouds.iter().map(|(source, target)| source.graph.k.max(target.graph.k)).max();
+        let inputs = match k {
+            Some(k) => BatchInputs::Clouds(Clouds::new(&clouds, k)),
             None => BatchInputs::Points(points, neighbors),
         };
         Self { inputs, truths }

@@ -367,10 +367,7 @@ impl TemperatureNet {
 
     fn observed<'a>(self, batch: &mut impl Iterator<Item = &'a [Tensor<1>; 2]>, share: f64) -> Self {
         let observe = |layer| match layer {
-            Layer::Norm(norm) => Layer::Norm(match batch.next() {
-                Some(statistics) => norm.observed(statistics, share),
-                None => norm,
-            }),
+            Layer::Norm(norm) => Layer::Norm(norm.observed(batch, share)),
             other => other,
         };
         Self { nn: self.nn.into_iter().map(observe).collect() }

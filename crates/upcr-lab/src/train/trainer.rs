@@ -221,7 +221,7 @@ impl Trainer {
             from: Position { epoch: done / per_epoch, batch: done % per_epoch },
         });
         let seen = place.stage.network(&config.network);
-        let prepare = move |example: &Example| seen.example(example);
+        let prepare = move |example: &Example| seen.input(example.source.clone(), example.target.clone());
         let mut batches = Loader::start(shapes, &plan, place.stage.batch, LOADER_THREADS, prepare)?;
         let mut since = Since::default();
         let mut saved = Instant::now();
