@@ -29,11 +29,14 @@ fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().try_to_vec().unwrap()
 }
 
+/// With `--nocapture` tells how far off it is.
 #[track_caller]
+#[allow(clippy::print_stderr)]
 fn assert_close(what: &str, found: &[f32], expected: &[f32]) {
     assert_eq!(found.len(), expected.len(), "{what}");
     let scale = expected.iter().fold(1e-3_f32, |s, v| s.max(v.abs()));
     let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    eprintln!("{what}: {:e}", worst / scale);
     assert!(worst <= 1e-4 * scale, "{what}: {worst} off of {scale}");
 }
 
