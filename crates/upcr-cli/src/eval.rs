@@ -30,7 +30,7 @@ pub struct Args {
     /// Which part of its points a cloud keeps
     #[arg(long, value_enum, value_delimiter = ',', default_value = "consistent")]
     overlap: Vec<Overlap>,
-    /// Methods: upcr (the network alone, once), upcr+refine, icp, gicp, fgr, icp+spfh, icp+pfh, consensus, features, default; and trained
+    /// Methods: upcr (the network alone, once), upcr+refine, upcr+register, icp, gicp, fgr, icp+spfh, icp+pfh, consensus, features, default; and trained
     /// networks as NAME=WEIGHTS (dcp=run/weights.safetensors)
     #[arg(long, value_delimiter = ',', default_value = "upcr,upcr+refine,icp,fgr,default")]
     methods: Vec<String>,

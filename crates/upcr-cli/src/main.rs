@@ -12,6 +12,8 @@ mod input;
 mod output;
 mod pairs;
 mod register;
+#[cfg(feature = "train")]
+mod reproduce;
 mod synth;
 #[cfg(feature = "train")]
 mod train;
@@ -61,6 +63,8 @@ enum Command {
     Adapt(adapt::Args),
     Eval(eval::Args),
     #[cfg(feature = "train")]
+    Reproduce(reproduce::Args),
+    #[cfg(feature = "train")]
     Import(import::Args),
 }
 
@@ -76,6 +80,8 @@ fn main() -> ExitCode {
         #[cfg(feature = "train")]
         Command::Adapt(args) => adapt::run(&args),
         Command::Eval(args) => eval::run(&args),
+        #[cfg(feature = "train")]
+        Command::Reproduce(args) => reproduce::run(&args),
         #[cfg(feature = "train")]
         Command::Import(args) => import::run(&args),
     };

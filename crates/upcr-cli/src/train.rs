@@ -230,7 +230,7 @@ impl Watcher for Teller {
 }
 
 /// Hours and minutes, or minutes and seconds.
-fn duration(d: Duration) -> String {
+pub fn duration(d: Duration) -> String {
     let s = d.as_secs();
     if s >= 3600 { format!("{}h{:02}m", s / 3600, s / 60 % 60) } else { format!("{}m{:02}s", s / 60, s % 60) }
 }

@@ -250,3 +250,112 @@ fn what_is_no_published_network_is_not_imported() {
     upcr(["import", "absent.t7", "--out", &out]).assert_fails(1, &["absent.t7"]);
     assert!(!Path::new(&out).exists());
 }
+
+const EXPERIMENT: &str = r#"
+title = "A few boxes"
+paper = "table"
+data = ["absent", "shapes"]
+seeds = 2
+columns = ["rmse_r_deg", "mae_r_deg", "found"]
+plot = { kind = "dots", measure = "mae_r_deg" }
+[[setting]]
+name = "clean"
+[[setting]]
+name = "partial, noisy"
+overlap = "partial_shared"
+noise = true
+[[method]]
+name = "ICP"
+run = "icp"
+paper.clean = { rmse_r_deg = 12.5 }
+[[method]]
+name = "UPCR"
+network = "upcr"
+changes = ["network.widths=[8, 8]"]
+adapt = "tested"
+[[method]]
+name = "PointNetLK"
+network = "pointnetlk"
+settings = ["clean"]
+"#;
+const BUDGET: &str = "\
+points = 64
+neighbors = 6
+narrow = true
+batch = 3
+pairs = 2
+decay = \"cosine\"
+[training]
+upcr = { length = { steps = 30 }, learning_rate = 1e-3 }
+pointnetlk = { length = { steps = 20 }, learning_rate = 1e-3 }
+[adaptation]
+length = { epochs = 4 }
+learning_rate = 1e-3
+";
+
+/// What was measured, but for times.
+fn measured(folder: &str) -> serde_json::Value {
+    let text = std::fs::read_to_string(Path::new(folder).join("results.json")).unwrap();
+    let results: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let mut cells = results["experiments"][0]["cells"].clone();
+    for cell in cells.as_array_mut().unwrap() {
+        let values = cell["values"].as_object_mut().unwrap();
+        values.retain(|name, _| !name.starts_with("ms"));
+    }
+    cells
+}
+
+#[test]
+fn experiments_are_reproduced_and_go_on_after_a_kill() {
+    let scratch = Scratch::new();
+    shapes(&scratch);
+    let data = scratch.path("");
+    let (experiment, budget) = (scratch.file("boxes.toml", EXPERIMENT), scratch.file("tiny.toml", BUDGET));
+    let arguments = |out: &str| {
+        ["reproduce", &experiment, "--budget", &budget, "--data", &data, "--out", out].map(str::to_owned)
+    };
+    let whole = scratch.path("whole");
+    let run = upcr(arguments(&whole));
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let cells = measured(&whole);
+    // Two seeds of UPCR in two settings, of PointNetLK in one; ICP has none.
+    assert_eq!(cells.as_array().unwrap().len(), 2 + 4 + 2);
+    let report = std::fs::read_to_string(run.stdout.trim()).unwrap();
+    assert!(report.contains("| UPCR |") && report.contains(" ± ") && report.contains("12.500"), "{report}");
+    let file = |extension: &str| std::fs::read(Path::new(&whole).join(format!("boxes.{extension}"))).unwrap();
+    assert!(file("png").starts_with(b"\x89PNG") && file("svg").starts_with(b"<svg"));
+    assert_eq!(String::from_utf8(file("csv")).unwrap().lines().count(), 1 + 8);
+
+    // What is done is not done again.
+    let again = upcr(arguments(&whole));
+    assert_eq!((again.status, again.stderr.contains("training")), (0, false), "{}", again.stderr);
+    assert_eq!(measured(&whole), cells);
+
+    let killed = scratch.path("killed");
+    let mut child =
+        command().args(arguments(&killed)).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    while !Path::new(&killed).join("tests").exists() {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    std::thread::sleep(Duration::from_millis(150));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    let resumed = upcr(arguments(&killed));
+    assert_eq!(resumed.status, 0, "{}", resumed.stderr);
+    assert_eq!(measured(&killed), cells);
+}
+
+#[test]
+fn what_cannot_be_reproduced_is_told() {
+    let scratch = Scratch::new();
+    let (data, out) = (scratch.path(""), scratch.path("out"));
+    let run = upcr(["reproduce", "everything", "--data", &data, "--out", &out]);
+    assert!(run.status == 1 && run.stderr.contains("there are consistent, partial"), "{}", run.stderr);
+    let run = upcr(["reproduce", "consistent", "--budget", "endless", "--data", &data, "--out", &out]);
+    assert!(run.status == 1 && run.stderr.contains("full, quick"), "{}", run.stderr);
+    let run = upcr(["reproduce", "consistent", "--data", &scratch.path("nowhere"), "--out", &out]);
+    assert!(run.status == 1 && run.stderr.contains("nowhere"), "{}", run.stderr);
+    let run = upcr(["reproduce", "consistent", "--data", &data, "--out", &out]);
+    assert!(run.status == 0 && run.stderr.contains("skipped consistent"), "{}", run.stderr);
+    assert!(std::fs::read_to_string(run.stdout.trim()).unwrap().contains("Not done"));
+}

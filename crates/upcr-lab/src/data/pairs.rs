@@ -10,6 +10,7 @@ use std::fmt;
 use nalgebra::{Rotation3, Vector3};
 use rand::seq::SliceRandom;
 use rand::{Rng, RngCore};
+use serde::{Deserialize, Serialize};
 use upcr::{CloudRole, Error, PointCloud, Result, Rigid};
 
 use crate::random;
@@ -22,8 +23,10 @@ const VIEWPOINT_DISTANCE: f64 = 500.0;
 const MAX_TRANSLATION: f64 = 0.5;
 
 /// How the target is moved against the source.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum MotionLaw {
+    #[default]
     /// `Rx·Ry·Rz` of three angles uniform in 0° to 45°; translations uniform in ±0.5 along each axis.
     Euler45,
     /// A rotation uniform over SO(3); translations as above.
@@ -37,9 +40,12 @@ pub enum MotionLaw {
 ///
 /// A partial cloud keeps the points nearest to a viewpoint in a random direction, far away. The viewpoint is fixed
 /// in the clouds' own frames: the same coordinates see another side of the moved target.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Coverage {
     /// Both clouds hold the same points, moved.
+    #[default]
+    #[serde(rename = "consistent")]
     Full,
     /// Both clouds are seen from the same coordinates.
     PartialShared,

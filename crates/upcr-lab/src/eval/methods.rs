@@ -26,9 +26,10 @@ pub struct EvaluatedMethod {
 type Plain = fn(&PointCloud, &PointCloud, &Settings) -> Result<Rigid>;
 
 /// Every method that needs no file. A new one is a line here.
-const METHODS: [(&str, Plain); 10] = [
+const METHODS: [(&str, Plain); 11] = [
     ("upcr", one_pass),
     ("upcr+refine", one_pass_refined),
+    ("upcr+register", upcr_alone),
     ("icp", icp),
     ("gicp", gicp),
     ("fgr", fgr),
@@ -102,6 +103,12 @@ fn one_pass(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Re
 fn one_pass_refined(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
     let init = Some(one_pass(source, target, settings)?);
     let settings = Settings { method: Method::Prior, init, ..settings.clone() };
+    Ok(register(source, target, &settings)?.T_target_source)
+}
+
+/// What `register` does when the network is the only source of first poses: clouds of any size and place.
+fn upcr_alone(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Rigid> {
+    let settings = Settings { method: Method::Upcr, ..settings.clone() };
     Ok(register(source, target, &settings)?.T_target_source)
 }
 

@@ -69,33 +69,57 @@ pub fn evaluate(
     (name, protocol): (&str, &Protocol),
     told: &mut dyn FnMut(usize),
 ) -> Result<Row> {
-    let mut poses = Vec::with_capacity(shapes.len());
-    let mut diameters = Vec::with_capacity(shapes.len());
+    let pair = |item: usize| protocol.pair(&shapes.points(item), item as u64);
+    let tolerance = |pair: &Pair| Tolerance::object(diameter(&pair.source.points));
+    let row = evaluate_pairs(method, settings, shapes.len(), pair, tolerance, told)?;
+    Ok(Row {
+        protocol: name.into(),
+        overlap: overlap_name(protocol.coverage).into(),
+        noise: protocol.noise.map_or(0.0, |noise| noise.sigma),
+        ..row
+    })
+}
+
+/// The same over `count` pairs of any origin, of each of which `tolerance` says how far off a pose may be.
+///
+/// # Errors
+/// Where a pair cannot be had.
+pub fn evaluate_pairs(
+    method: &EvaluatedMethod,
+    settings: &Settings,
+    count: usize,
+    pair: impl Fn(usize) -> Result<Pair>,
+    tolerance: impl Fn(&Pair) -> Tolerance,
+    told: &mut dyn FnMut(usize),
+) -> Result<Row> {
+    let mut poses = Vec::with_capacity(count);
+    let mut tolerances = Vec::with_capacity(count);
     let mut bregier = 0.0;
-    let mut times_ms = Vec::with_capacity(shapes.len());
+    let mut times_ms = Vec::with_capacity(count);
     let mut warm = false;
-    for item in 0..shapes.len() {
-        let Pair { source, target, T_target_source } = protocol.pair(&shapes.points(item), item as u64)?;
+    for item in 0..count {
+        let pair = pair(item)?;
+        let Pair { source, target, T_target_source } = &pair;
         if !std::mem::replace(&mut warm, true) {
-            estimated(method, &source, &target, settings);
+            estimated(method, source, target, settings);
         }
         let start = Instant::now();
-        let estimate = estimated(method, &source, &target, settings);
+        let estimate = estimated(method, source, target, settings);
         times_ms.push(start.elapsed().as_secs_f64() * 1e3);
-        bregier += ShapeSpread::of(&source.points).distance(&estimate, &T_target_source);
-        diameters.push(diameter(&source.points));
-        poses.push((estimate, T_target_source));
+        bregier += ShapeSpread::of(&source.points).distance(&estimate, T_target_source);
+        tolerances.push(tolerance(&pair));
+        poses.push((estimate, *T_target_source));
         told(item + 1);
     }
     let errors = PoseErrors::of(&poses);
-    let recall = Recall::of(&poses, |i| Tolerance::object(diameters[i]));
+    let recall = Recall::of(&poses, |i| tolerances[i]);
     let mean_ms = times_ms.iter().sum::<f64>() / times_ms.len() as f64;
     times_ms.sort_by(f64::total_cmp);
     Ok(Row {
         method: method.name.clone(),
-        protocol: name.into(),
-        overlap: overlap_name(protocol.coverage).into(),
-        noise: protocol.noise.map_or(0.0, |noise| noise.sigma),
+        protocol: String::new(),
+        overlap: String::new(),
+        noise: 0.0,
         pairs: poses.len(),
         rmse_r_deg: errors.euler_rmse_deg,
         mae_r_deg: errors.euler_mae_deg,

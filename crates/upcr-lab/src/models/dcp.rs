@@ -103,6 +103,26 @@ impl Dcp {
         Self { config: DcpConfig { k, ..self.config.clone() }, ..self.clone() }
     }
 
+    /// Features of the points of sources and targets, each `[pairs, points, channels]`, and what the transformer makes of
+    /// them.
+    pub(super) fn features(
+        &self,
+        source_points: &Tensor<3>,
+        target_points: &Tensor<3>,
+        statistics: Statistics,
+        found: &mut BatchStatistics,
+    ) -> ([Tensor<3>; 2], [Tensor<3>; 2]) {
+        let [pairs, ..] = source_points.dims();
+        let clouds = Tensor::cat(vec![source_points.clone(), target_points.clone()], 0);
+        let features = self.emb_nn.forward(&clouds, self.config.k, statistics, found);
+        let (source, target) = (features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs));
+        let attended = match &self.pointer {
+            Some(pointer) => pointer.forward(&source, &target),
+            None => [source.clone(), target.clone()],
+        };
+        ([source, target], attended)
+    }
+
     /// From `[pairs, points, 3]` of sources and targets.
     pub fn forward(
         &self,
@@ -111,14 +131,8 @@ impl Dcp {
         statistics: Statistics,
     ) -> DcpOutput {
         let mut found = Vec::new();
-        let [pairs, ..] = source_points.dims();
-        let clouds = Tensor::cat(vec![source_points.clone(), target_points.clone()], 0);
-        let features = self.emb_nn.forward(&clouds, self.config.k, statistics, &mut found);
-        let (source, target) = (features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs));
-        let [source_attended, target_attended] = match &self.pointer {
-            Some(pointer) => pointer.forward(&source, &target),
-            None => [source.clone(), target.clone()],
-        };
+        let ([source, target], [source_attended, target_attended]) =
+            self.features(source_points, target_points, statistics, &mut found);
         let (rotation, translation) = soft_pose(
             source_points,
             target_points,

@@ -426,6 +426,33 @@ impl Learned {
         Ok(poses.first().copied().unwrap_or_else(Rigid::identity))
     }
 
+    /// What of a pair's pose is the network's work, without the way from its features to the pose: to be timed.
+    ///
+    /// # Errors
+    /// As [`Self::predict`].
+    pub fn embed(&self, source: Vec<[f32; 3]>, target: Vec<[f32; 3]>) -> Result<()> {
+        let network = self.valid();
+        let batch = Batch::new(vec![self.config().input(source, target)?], vec![Rigid::identity()]);
+        match &network {
+            Self::Upcr(network) => drop(network.forward(batch.clouds()?, Statistics::Running)),
+            Self::Dcp(network) => {
+                let [source, target] = batch.points(&network.devices()[0])?;
+                drop(network.features(&source, &target, Statistics::Running, &mut Vec::new()));
+            }
+            Self::Prnet(network) => {
+                let [source, target] = batch.points(&network.devices()[0])?;
+                for _ in 0..network.config.passes {
+                    drop(network.features(&source, &target, Statistics::Running, &mut Vec::new()));
+                }
+            }
+            Self::PointNetLk(network) => {
+                let [source, target] = batch.points(&network.devices()[0])?;
+                network.features(&source, &target);
+            }
+        }
+        Ok(())
+    }
+
     /// The network that a file holds.
     ///
     /// # Errors

@@ -152,6 +152,16 @@ impl PointNetLk {
         PointNetLkOutput { series, pose, residual, statistics: found }
     }
 
+    /// As many features as a pose takes: the target's, those of its twists, and the source's at every step.
+    pub(super) fn features(&self, source_points: &Tensor<3>, target_points: &Tensor<3>) {
+        for _ in 0..1 + 6 {
+            drop(self.feature_model.forward(target_points, Statistics::Running, &mut Vec::new()));
+        }
+        for _ in 0..self.config.steps {
+            drop(self.feature_model.forward(source_points, Statistics::Running, &mut Vec::new()));
+        }
+    }
+
     /// Changes of the target's feature by its twists, `[pairs, channels, 6]`.
     fn jacobian(
         &self,

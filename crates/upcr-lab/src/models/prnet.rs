@@ -137,6 +137,22 @@ impl Prnet {
         Self { config: PrnetConfig { k, ..self.config.clone() }, ..self.clone() }
     }
 
+    /// Features of the points of sources and targets, each `[pairs, points, channels]`.
+    pub(super) fn features(
+        &self,
+        source_points: &Tensor<3>,
+        target_points: &Tensor<3>,
+        statistics: Statistics,
+        found: &mut BatchStatistics,
+    ) -> [Tensor<3>; 2] {
+        let [pairs, ..] = source_points.dims();
+        let clouds = Tensor::cat(vec![source_points.clone(), target_points.clone()], 0);
+        let features = self.emb_nn.forward(&clouds, self.config.k, statistics, found);
+        let (source, target) = (features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs));
+        let [source_gain, target_gain] = self.attention.forward(&source, &target);
+        [source + source_gain, target + target_gain]
+    }
+
     /// One pass, from `[pairs, points, 3]` of sources and targets. Where partners are drawn, `random` draws them; without
     /// it they are the most alike.
     pub fn pass(
@@ -148,11 +164,7 @@ impl Prnet {
     ) -> PrnetOutput {
         let mut found = Vec::new();
         let [pairs, ..] = source_points.dims();
-        let clouds = Tensor::cat(vec![source_points.clone(), target_points.clone()], 0);
-        let features = self.emb_nn.forward(&clouds, self.config.k, statistics, &mut found);
-        let (source, target) = (features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs));
-        let [source_gain, target_gain] = self.attention.forward(&source, &target);
-        let (source, target) = (source + source_gain, target + target_gain);
+        let [source, target] = self.features(source_points, target_points, statistics, &mut found);
         let (sharpness, disparity) = self.temp_net.forward(&source, &target, statistics, &mut found);
         let (source_keypoints, source) = self.keypoints(source_points, source);
         let (target_keypoints, target) = self.keypoints(target_points, target);

@@ -22,6 +22,10 @@ pub struct Adaptation {
     pub helped: bool,
     /// On the clouds' own pairs before, and after.
     pub errors: [ValidationErrors; 2],
+    /// Steps done.
+    pub steps: u64,
+    /// Seconds spent on them.
+    pub seconds: f64,
     /// Whether the run came to its end; stopped early, what had been learned until then counts.
     pub finished: bool,
 }
@@ -62,5 +66,6 @@ pub fn adapt(
     let helped = after.loss < before.loss;
     let network = if helped { trainer.network() } else { network }.clone();
     write_history(folder, trainer.history())?;
-    Ok(Adaptation { network, helped, errors: [before, after], finished })
+    let (steps, seconds) = (trainer.steps(), trainer.seconds());
+    Ok(Adaptation { network, helped, errors: [before, after], steps, seconds, finished })
 }

@@ -5,61 +5,69 @@ use std::path::Path;
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
-use plotters::style::RGBColor;
-use upcr::{Error, Result};
+use upcr::Result;
 
 use super::history::Event;
+use crate::drawing::{self, COLORS, Drawn, Picture};
 use crate::files::write_atomically;
 
-/// Colours that the colour-blind can tell apart (Okabe and Ito).
-const BLUE: RGBColor = RGBColor(0, 114, 178);
-const ORANGE: RGBColor = RGBColor(230, 159, 0);
 const SIZE: (u32, u32) = (960, 420);
 
 /// A name, a colour, and points (step, value).
 type Line = (&'static str, RGBColor, Vec<(f64, f64)>);
-type Panel<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+
+/// Loss and held-out rotation error over the steps.
+struct LearningCurve<'a>(&'a [Event]);
 
 /// Loss and held-out rotation error over the steps, as SVG; empty for a curve without a point.
 ///
 /// # Errors
 /// Where the picture cannot be drawn.
 pub fn learning_curve(history: &[Event]) -> Result<String> {
-    let mut text = String::new();
     if history.is_empty() {
-        return Ok(text);
+        return Ok(String::new());
     }
-    let failed = |reason: String| Error::InvalidSetting { name: "plot", reason };
-    let mut drawn = || -> std::result::Result<(), Box<dyn std::error::Error>> {
-        let root = SVGBackend::with_string(&mut text, SIZE).into_drawing_area();
-        root.fill(&WHITE)?;
-        let (left, right) = root.split_horizontally(SIZE.0 / 2);
+    drawing::svg(&LearningCurve(history))
+}
+
+impl Picture for LearningCurve<'_> {
+    fn size(&self) -> (u32, u32) {
+        SIZE
+    }
+
+    fn draw<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
+    where
+        B::ErrorType: 'static,
+    {
+        let [learned, held_out, ..] = COLORS;
+        let (left, right) = area.split_horizontally(SIZE.0 * unit / 2);
         let at = |value: fn(&Event) -> Option<f64>| -> Vec<(f64, f64)> {
-            let points = history.iter().filter_map(|e| Some((e.step as f64, value(e)?)));
+            let points = self.0.iter().filter_map(|e| Some((e.step as f64, value(e)?)));
             points.filter(|(_, y)| y.is_finite() && *y > 0.0).collect()
         };
         panel(
             &left,
+            unit,
             "Chamfer loss",
             &[
-                ("learned from", BLUE, at(|e| Some(e.loss))),
-                ("held out", ORANGE, at(|e| e.validation.map(|v| v.loss))),
+                ("learned from", learned, at(|e| Some(e.loss))),
+                ("held out", held_out, at(|e| e.validation.map(|v| v.loss))),
             ],
         )?;
         panel(
             &right,
+            unit,
             "held out: MAE(R), degrees",
-            &[("held out", ORANGE, at(|e| e.validation.map(|v| v.mae_r_deg)))],
-        )?;
-        root.present()?;
-        Ok(())
-    };
-    drawn().map_err(|e| failed(e.to_string()))?;
-    Ok(text)
+            &[("held out", held_out, at(|e| e.validation.map(|v| v.mae_r_deg)))],
+        )
+    }
 }
 
 /// Lines over the steps, the values' axis logarithmic.
-fn panel(area: &Panel, title: &str, lines: &[Line]) -> std::result::Result<(), Box<dyn std::error::Error>> {
+fn panel<B: DrawingBackend>(area: &DrawingArea<B, Shift>, unit: u32, title: &str, lines: &[Line]) -> Drawn
+where
+    B::ErrorType: 'static,
+{
     let all = || lines.iter().flat_map(|(_, _, points)| points);
     let last = all().map(|p| p.0).fold(1.0, f64::max);
     let low = all().map(|p| p.1).fold(f64::INFINITY, f64::min);
@@ -68,20 +76,28 @@ fn panel(area: &Panel, title: &str, lines: &[Line]) -> std::result::Result<(), B
         return Ok(());
     }
     let mut chart = ChartBuilder::on(area)
-        .caption(title, ("sans-serif", 18))
-        .margin(12)
-        .x_label_area_size(36)
-        .y_label_area_size(64)
+        .caption(title, ("sans-serif", 18 * unit))
+        .margin(12 * unit)
+        .x_label_area_size(36 * unit)
+        .y_label_area_size(64 * unit)
         .build_cartesian_2d(0.0..last, (low * 0.8..high * 1.25).log_scale())?;
-    chart.configure_mesh().light_line_style(WHITE).x_desc("steps").x_labels(6).draw()?;
+    let label = ("sans-serif", 12 * unit);
+    chart.configure_mesh().light_line_style(WHITE).label_style(label).x_desc("steps").x_labels(6).draw()?;
     for (name, color, points) in lines {
         let color = *color;
         chart
-            .draw_series(LineSeries::new(points.iter().copied(), color.stroke_width(2)))?
+            .draw_series(LineSeries::new(points.iter().copied(), color.stroke_width(2 * unit)))?
             .label(*name)
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], color.stroke_width(2)));
+            .legend(move |(x, y)| {
+                PathElement::new([(x, y), (x + 18 * unit as i32, y)], color.stroke_width(2 * unit))
+            });
     }
-    chart.configure_series_labels().background_style(WHITE.mix(0.8)).border_style(BLACK.mix(0.3)).draw()?;
+    chart
+        .configure_series_labels()
+        .label_font(label)
+        .background_style(WHITE.mix(0.8))
+        .border_style(BLACK.mix(0.3))
+        .draw()?;
     Ok(())
 }
 

@@ -107,21 +107,36 @@ impl Trainer {
         Ok(Self { folder: folder.into(), network, optimizer: adam(), state })
     }
 
+    /// A new run, or where one of this configuration in `folder` was stopped, that one.
+    ///
+    /// # Errors
+    /// As [`Self::new`], or where a checkpoint is damaged.
+    pub fn start(config: TrainingConfig, folder: &Path, device: &Device) -> Result<Self> {
+        match Self::stopped(&config, folder, device)? {
+            Some(stopped) => Ok(stopped),
+            None => Self::new(config, folder, device),
+        }
+    }
+
     /// A run on weights that were learned before; goes on where one of this configuration in `folder` was stopped.
     ///
     /// # Errors
     /// Where the configuration cannot be run, or a checkpoint is damaged.
     pub fn adapting(config: TrainingConfig, network: &Learned, folder: &Path) -> Result<Self> {
         config.check()?;
-        let device = network.device();
-        if folder.join(CHECKPOINT).exists() {
-            let stopped = Self::resume(folder, &device.inner())?;
-            if stopped.state.config == config {
-                return Ok(stopped);
-            }
+        if let Some(stopped) = Self::stopped(&config, folder, &network.device().inner())? {
+            return Ok(stopped);
         }
         let state = State { config, step: 0, seconds: 0.0, history: History::new() };
         Ok(Self { folder: folder.into(), network: network.clone(), optimizer: adam(), state })
+    }
+
+    /// The run in `folder`, where there is one of this configuration.
+    fn stopped(config: &TrainingConfig, folder: &Path, device: &Device) -> Result<Option<Self>> {
+        if !folder.join(CHECKPOINT).exists() {
+            return Ok(None);
+        }
+        Ok(Some(Self::resume(folder, device)?).filter(|stopped| stopped.state.config == *config))
     }
 
     /// Goes on where the run in `folder` was stopped.
@@ -142,6 +157,16 @@ impl Trainer {
     /// What the run was told.
     pub fn config(&self) -> &TrainingConfig {
         &self.state.config
+    }
+
+    /// Steps done.
+    pub fn steps(&self) -> u64 {
+        self.state.step
+    }
+
+    /// Seconds spent on them.
+    pub fn seconds(&self) -> f64 {
+        self.state.seconds
     }
 
     /// The learning curve so far.

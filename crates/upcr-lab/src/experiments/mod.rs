@@ -1,0 +1,154 @@
+//! The paper's experiments: what each is, what it takes, and what came of it.
+
+mod budget;
+mod description;
+mod plan;
+mod plot;
+mod report;
+mod reproduce;
+mod timing;
+
+pub use budget::{Budget, Learning};
+pub use description::{Experiment, Values};
+pub use plot::picture;
+pub use report::{csv, markdown};
+pub use reproduce::{Outcome, Progress, Reproduction, Results, Spectator};
+
+use upcr::{Error, Result};
+
+/// Names and files of the experiments that come with the program. A new one is a file and a line here.
+static EXPERIMENTS: [(&str, &str); 7] = [
+    ("consistent", include_str!("../../../../experiments/consistent.toml")),
+    ("partial", include_str!("../../../../experiments/partial.toml")),
+    ("seven_scenes", include_str!("../../../../experiments/seven_scenes.toml")),
+    ("rotation", include_str!("../../../../experiments/rotation.toml")),
+    ("outliers", include_str!("../../../../experiments/outliers.toml")),
+    ("invariants", include_str!("../../../../experiments/invariants.toml")),
+    ("time", include_str!("../../../../experiments/time.toml")),
+];
+
+/// Names of the experiments.
+pub fn names() -> impl Iterator<Item = &'static str> {
+    EXPERIMENTS.iter().map(|(name, _)| *name)
+}
+
+/// The experiment of that name.
+///
+/// # Errors
+/// Where there is none.
+pub fn by_name(name: &str) -> Result<Experiment> {
+    match EXPERIMENTS.iter().find(|(known, _)| *known == name) {
+        Some((_, text)) => Experiment::from_toml(text),
+        None => {
+            let known = names().collect::<Vec<_>>().join(", ");
+            let reason = format!("there is no {name}; there are {known}");
+            Err(Error::InvalidSetting { name: "experiment", reason })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::data::pairs::Coverage;
+
+    /// A data folder with empty data sets of these names.
+    fn root(names: &[&str]) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        names.iter().for_each(|name| std::fs::create_dir(folder.path().join(name)).unwrap());
+        folder
+    }
+
+    #[test]
+    fn every_experiment_can_be_planned_in_every_budget() {
+        let root = root(&["shapes69", "redkitchen"]);
+        for budget in ["quick", "full"] {
+            let budget = Budget::by_name(budget).unwrap();
+            for name in names() {
+                let experiment = by_name(name).unwrap();
+                let cells = experiment.plan(&budget, root.path()).unwrap().unwrap();
+                // Every method in each of its settings, and what the paper says of it is in one of these.
+                for method in &experiment.methods {
+                    let tested: Vec<&str> = (cells.iter())
+                        .filter(|cell| cell.method == method.name)
+                        .map(|cell| cell.setting.as_str())
+                        .collect();
+                    assert!(!tested.is_empty(), "{name}: {}", method.name);
+                    assert!(method.paper.keys().all(|setting| tested.contains(&setting.as_str())), "{name}");
+                }
+            }
+        }
+        assert!(by_name("everything").is_err());
+    }
+
+    #[test]
+    fn what_is_the_same_is_done_once() {
+        let root = root(&["shapes69", "redkitchen"]);
+        let budget = Budget::by_name("quick").unwrap();
+        let mut weights = BTreeMap::new();
+        for name in ["consistent", "rotation", "invariants", "outliers", "seven_scenes"] {
+            for cell in by_name(name).unwrap().plan(&budget, root.path()).unwrap().unwrap() {
+                if let Some(found) = cell.test.weights {
+                    let users: &mut Vec<&str> = weights.entry(found.unadapted().id()).or_default();
+                    users.push(name);
+                }
+            }
+        }
+        // The network with distances and Euler angles of the first seed stands in all of them.
+        weights.values_mut().for_each(Vec::dedup);
+        assert_eq!(weights.values().filter(|users| users.len() == 5).count(), 1, "{weights:?}");
+    }
+
+    #[test]
+    fn data_are_the_first_that_are_there_and_without_them_nothing_is_planned() {
+        let budget = Budget::by_name("quick").unwrap();
+        let experiment = by_name("consistent").unwrap();
+        assert_eq!(experiment.plan(&budget, root(&["redkitchen"]).path()).unwrap(), None);
+        for (there, taken) in [
+            (vec!["shapes69"], "shapes69"),
+            (vec!["shapes69", "modelnet40_ply_hdf5_2048"], "modelnet40_ply_hdf5_2048"),
+        ] {
+            let cells = experiment.plan(&budget, root(&there).path()).unwrap().unwrap();
+            assert!(cells.iter().all(|cell| cell.test.data == taken));
+        }
+    }
+
+    #[test]
+    fn partial_clouds_are_learned_from_in_the_size_they_are_tested_in() {
+        let root = root(&["shapes69"]);
+        let budget = Budget::by_name("full").unwrap();
+        let cells = by_name("partial").unwrap().plan(&budget, root.path()).unwrap().unwrap();
+        for weights in cells.iter().filter_map(|cell| cell.test.weights.as_ref()) {
+            assert_eq!(weights.training.stages[0].points, 768);
+            assert_eq!(weights.last().stages[0].points, 768);
+            assert_eq!(weights.overlaps, [Coverage::PartialShared, Coverage::PartialIndependent]);
+        }
+        // Where a setting says so, nothing learns on.
+        let adapts = |setting: &str| {
+            let mut of_setting = cells.iter().filter(|cell| cell.setting == setting);
+            of_setting.any(|cell| cell.test.weights.as_ref().is_some_and(|w| w.adaptation.is_some()))
+        };
+        assert!(adapts("UPC, shared") && !adapts("UPC, own"));
+    }
+
+    #[test]
+    fn what_is_no_experiment_is_refused() {
+        let start = "title = \"a\"\npaper = \"b\"\ndata = [\"c\"]\ncolumns = [\"recall\"]\n";
+        let setting = "[[setting]]\nname = \"d\"\n";
+        let method = "[[method]]\nname = \"e\"\nrun = \"icp\"\n";
+        let whole = format!("{start}{setting}{method}");
+        assert!(Experiment::from_toml(&whole).is_ok());
+        for text in [
+            format!("{start}{setting}"),
+            format!("{start}{method}"),
+            format!("{whole}settings = [\"f\"]\n"),
+            format!("{whole}paper.f = {{ recall = 1.0 }}\n"),
+            format!("{start}{setting}[[method]]\nname = \"e\"\n"),
+            format!("colour = 3\n{whole}"),
+        ] {
+            assert!(Experiment::from_toml(&text).is_err(), "{text}");
+        }
+    }
+}

@@ -1,0 +1,247 @@
+//! Results as tables, Markdown for people and comma-separated values for programs.
+
+use std::fmt::Write;
+
+use super::description::{Experiment, Measure, PlotKind};
+use super::reproduce::{Lesson, Measured, Outcome, Results};
+
+/// A measure: its name, how tables head it, and digits after the point.
+struct Column {
+    name: &'static str,
+    heading: &'static str,
+    digits: usize,
+}
+
+/// Every measure that tables know. Another one is headed by its name.
+static COLUMNS: [Column; 13] = [
+    Column { name: "rmse_r_deg", heading: "RMSE(R) °", digits: 3 },
+    Column { name: "mae_r_deg", heading: "MAE(R) °", digits: 3 },
+    Column { name: "rmse_t", heading: "RMSE(t)", digits: 5 },
+    Column { name: "mae_t", heading: "MAE(t)", digits: 5 },
+    Column { name: "rre_mean_deg", heading: "RRE °", digits: 3 },
+    Column { name: "rte_mean", heading: "RTE", digits: 5 },
+    Column { name: "me_bregier", heading: "ME(T)", digits: 4 },
+    Column { name: "recall", heading: "recall", digits: 3 },
+    Column { name: "found", heading: "found", digits: 0 },
+    Column { name: "features_ms", heading: "features, ms", digits: 2 },
+    Column { name: "network_ms", heading: "network, ms", digits: 2 },
+    Column { name: "solve_ms", heading: "solve, ms", digits: 2 },
+    Column { name: "total_ms", heading: "all, ms", digits: 2 },
+];
+
+/// How a measure is called.
+pub(super) fn heading(measure: &str) -> &str {
+    COLUMNS.iter().find(|column| column.name == measure).map_or(measure, |column| column.heading)
+}
+
+fn digits(measure: &str) -> usize {
+    COLUMNS.iter().find(|column| column.name == measure).map_or(3, |column| column.digits)
+}
+
+/// Mean and standard deviation over seeds; no deviation of a single one.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Spread {
+    pub mean: f64,
+    pub deviation: Option<f64>,
+}
+
+impl Outcome {
+    /// A measure of a method in a setting, over its seeds; `None` where it was not taken.
+    pub(super) fn spread(&self, setting: &str, method: &str, measure: &str) -> Option<Spread> {
+        let values: Vec<f64> =
+            self.of(setting, method).filter_map(|cell| cell.values.get(measure).copied()).collect();
+        let count = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / count;
+        let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (count - 1.0);
+        let deviation = (values.len() > 1).then(|| variance.sqrt());
+        (!values.is_empty()).then_some(Spread { mean, deviation })
+    }
+
+    fn of<'a>(&'a self, setting: &'a str, method: &'a str) -> impl Iterator<Item = &'a Measured> {
+        self.cells.iter().filter(move |cell| cell.setting == setting && cell.method == method)
+    }
+}
+
+/// Everything as one Markdown text. `command` is what gave it.
+pub fn markdown(results: &Results, command: &str) -> String {
+    let mut text = String::new();
+    let budget = toml::to_string(&results.budget).unwrap_or_default();
+    // Writing to a string cannot fail.
+    let _ = writeln!(
+        text,
+        "`{command}`, upcr {}, {} threads. Budget `{}`:\n\n```toml\n{}```\n",
+        results.version, results.threads, results.budget_name, budget
+    );
+    for outcome in &results.experiments {
+        text.push_str(&section(outcome));
+    }
+    text.push_str(&lessons(&results.learned));
+    text
+}
+
+/// An experiment's heading, picture and tables.
+fn section(outcome: &Outcome) -> String {
+    let Experiment { title, paper, note, .. } = &outcome.experiment;
+    let mut text = format!("## {title}\n\nThe paper's {paper}; `upcr reproduce {}`.", outcome.name);
+    let Some(data) = &outcome.data else {
+        let names = outcome.experiment.data.join(", ");
+        let _ = writeln!(text, " Not done: none of the data sets is there ({names}).\n");
+        return text;
+    };
+    if outcome.experiment.measure == Measure::Errors {
+        let _ = write!(text, " Data: `{data}`");
+        if let Some(other) = outcome.learned_from.as_ref().filter(|other| *other != data) {
+            let _ = write!(text, ", learned from `{other}`");
+        }
+        text.push('.');
+    }
+    let _ = writeln!(text, " {note}\n");
+    if outcome.experiment.plot.is_some() {
+        let _ = writeln!(text, "![{title}]({}.svg)\n", outcome.name);
+    }
+    let lines = outcome.experiment.plot.as_ref().is_some_and(|plot| plot.kind == PlotKind::Lines);
+    for (index, table) in tables(outcome, lines).into_iter().enumerate() {
+        if index > 0 {
+            text.push('\n');
+        }
+        text.push_str(&table);
+    }
+    text.push('\n');
+    text
+}
+
+/// A table for each setting; where settings are steps of one thing, a table for each measure.
+fn tables(outcome: &Outcome, steps: bool) -> Vec<String> {
+    let Experiment { settings, methods, columns, .. } = &outcome.experiment;
+    if steps {
+        let heads: Vec<String> = settings.iter().map(|setting| setting.name.clone()).collect();
+        let table = |measure: &String| {
+            let cells = |method: &str| -> Vec<String> {
+                settings.iter().map(|setting| cell(outcome, &setting.name, method, measure)).collect()
+            };
+            let rows = methods.iter().map(|method| (method.name.clone(), cells(&method.name))).collect();
+            grid(heading(measure), &heads, rows)
+        };
+        return columns.iter().map(table).collect();
+    }
+    let mut tables = Vec::new();
+    for setting in settings {
+        let in_paper = |measure: &&String| {
+            methods.iter().any(|m| m.paper.get(&setting.name).is_some_and(|v| v.contains_key(*measure)))
+        };
+        let papers: Vec<&String> = columns.iter().filter(in_paper).collect();
+        let heads = columns.iter().map(|measure| heading(measure).to_owned());
+        let heads: Vec<String> =
+            heads.chain(papers.iter().map(|measure| format!("paper: {}", heading(measure)))).collect();
+        let rows = methods
+            .iter()
+            .filter(|method| method.is_tested_in(setting))
+            .map(|method| {
+                let ours = columns.iter().map(|measure| cell(outcome, &setting.name, &method.name, measure));
+                let theirs = papers.iter().map(|measure| {
+                    let value = method.paper.get(&setting.name).and_then(|values| values.get(*measure));
+                    value.map_or(String::new(), |value| format!("{value:.*}", digits(measure)))
+                });
+                (method.name.clone(), ours.chain(theirs).collect())
+            })
+            .collect();
+        tables.push(grid(&setting.name, &heads, rows));
+    }
+    tables
+}
+
+fn cell(outcome: &Outcome, setting: &str, method: &str, measure: &str) -> String {
+    let digits = digits(measure);
+    let pairs = outcome.spread(setting, method, "pairs");
+    match (outcome.spread(setting, method, measure), pairs) {
+        (None, _) => String::new(),
+        (Some(Spread { mean, .. }), Some(pairs)) if measure == "found" => {
+            format!("{mean:.0} of {:.0}", pairs.mean)
+        }
+        (Some(Spread { mean, deviation: None }), _) => format!("{mean:.digits$}"),
+        (Some(Spread { mean, deviation: Some(deviation) }), _) => {
+            format!("{mean:.digits$} ± {deviation:.digits$}")
+        }
+    }
+}
+
+fn grid(corner: &str, heads: &[String], rows: Vec<(String, Vec<String>)>) -> String {
+    let mut text = format!("| {corner} | {} |\n| --- |", heads.join(" | "));
+    text.push_str(&" ---: |".repeat(heads.len()));
+    text.push('\n');
+    for (name, cells) in rows {
+        let _ = writeln!(text, "| {name} | {} |", cells.join(" | "));
+    }
+    text
+}
+
+/// What has learned, and how.
+fn lessons(learned: &[Lesson]) -> String {
+    if learned.is_empty() {
+        return String::new();
+    }
+    let heads = ["data", "clouds", "steps", "s", "held out: MAE(R) °", "recall"].map(str::to_owned);
+    let rows = learned
+        .iter()
+        .map(|lesson| {
+            let data = match &lesson.of.adaptation {
+                Some(adaptation) => format!(
+                    "{}, {}, on",
+                    adaptation.data,
+                    adaptation.setting.protocol(lesson.of.last().stages[0].points)
+                ),
+                None => format!("{}, {:?}, {:?}", lesson.of.data, lesson.of.part, lesson.of.overlaps),
+            };
+            let held_out = |value: fn(&crate::train::ValidationErrors) -> f64| {
+                lesson.held_out.as_ref().map_or(String::new(), |errors| format!("{:.3}", value(errors)))
+            };
+            let cells = vec![
+                data,
+                lesson.shapes.to_string(),
+                lesson.steps.to_string(),
+                format!("{:.0}", lesson.seconds),
+                held_out(|errors| errors.mae_r_deg),
+                held_out(|errors| errors.recall),
+            ];
+            (format!("`{}`", lesson.weights), cells)
+        })
+        .collect();
+    format!(
+        "## What has learned\n\nTimes are those of steps, validation excluded.\n\n{}",
+        grid("weights", &heads, rows)
+    )
+}
+
+/// An experiment's measurements, one a line: every setting, method and seed, with the paper's figures where it has any.
+pub fn csv(outcome: &Outcome) -> String {
+    let columns = &outcome.experiment.columns;
+    let mut text = format!(
+        "experiment,data,setting,method,seed,{},{}\n",
+        columns.join(","),
+        columns.iter().map(|name| format!("paper_{name}")).collect::<Vec<_>>().join(",")
+    );
+    for cell in &outcome.cells {
+        let method = outcome.experiment.methods.iter().find(|method| method.name == cell.method);
+        let paper = method.and_then(|method| method.paper.get(&cell.setting));
+        let value = |values: Option<&super::Values>, name: &String| {
+            values.and_then(|values| values.get(name)).map_or(String::new(), f64::to_string)
+        };
+        let ours = columns.iter().map(|name| value(Some(&cell.values), name));
+        let theirs = columns.iter().map(|name| value(paper, name));
+        let _ = writeln!(
+            text,
+            "{},{},{},{},{},{}",
+            outcome.name,
+            outcome.data.as_deref().unwrap_or_default(),
+            quoted(&cell.setting),
+            quoted(&cell.method),
+            cell.seed,
+            ours.chain(theirs).collect::<Vec<_>>().join(",")
+        );
+    }
+    text
+}
+
+fn quoted(text: &str) -> String {
+    if text.contains([',', '"']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.to_owned() }
+}
