@@ -10,7 +10,7 @@ use upcr::Result;
 
 use super::attention::{Transformer, TransformerConfig};
 use super::dense::BatchStatistics;
-use super::dgcnn::{DEFAULT_K, Dgcnn, Edges, check_k};
+use super::dgcnn::{DEFAULT_K, DEFAULT_WIDTHS, Dgcnn, Edges, check_k};
 use super::layers::{Init, Statistics, check_channels};
 use super::procrustes;
 use super::truth::Truth;
@@ -21,6 +21,8 @@ use super::truth::Truth;
 pub struct DcpConfig {
     /// Neighbours of a point, itself included.
     pub k: usize,
+    /// Channels after each of the point feature's first four layers.
+    pub widths: [usize; 4],
     /// Channels of a point's feature.
     pub channels: usize,
     /// The transformer of DCP-v2; DCP-v1 has none, nor a file that tells none.
@@ -31,7 +33,7 @@ pub struct DcpConfig {
 impl Default for DcpConfig {
     fn default() -> Self {
         let pointer = TransformerConfig { channels: 512, heads: 4, blocks: 1, inner: 1024 };
-        Self { k: DEFAULT_K, channels: 512, pointer: Some(pointer) }
+        Self { k: DEFAULT_K, widths: DEFAULT_WIDTHS, channels: 512, pointer: Some(pointer) }
     }
 }
 
@@ -47,6 +49,7 @@ impl DcpConfig {
     /// Where a number is out of its range.
     pub fn check(&self) -> Result<()> {
         check_k(self.k)?;
+        self.widths.into_iter().try_for_each(check_channels)?;
         check_channels(self.channels)?;
         match &self.pointer {
             Some(pointer) => pointer.check(self.channels),
@@ -59,7 +62,7 @@ impl DcpConfig {
         let mut init = Init::new(rng, device);
         Dcp {
             config: self.clone(),
-            emb_nn: Dgcnn::init(Edges::Kept, self.channels, &mut init),
+            emb_nn: Dgcnn::init(Edges::Kept, self.widths, self.channels, &mut init),
             pointer: self.pointer.map(|config| Transformer::init(&config, 0.0, &mut init)),
         }
     }

@@ -15,8 +15,8 @@ use crate::ops::{BatchGraph, Normalized, NormalizedMap, graph_layer};
 
 /// Neighbours of a point, itself included, as published.
 pub const DEFAULT_K: usize = 20;
-/// Channels after each of the first four layers, which the fifth reads together.
-const WIDTHS: [usize; 4] = [64, 64, 128, 256];
+/// Channels after each of the first four layers, which the fifth reads together, as published.
+pub const DEFAULT_WIDTHS: [usize; 4] = [64, 64, 128, 256];
 /// Slope of PRNet's rectifiers for negative values.
 pub(super) const NEGATIVE_SLOPE: f32 = 0.2;
 
@@ -57,8 +57,12 @@ pub struct Dgcnn {
 }
 
 impl Dgcnn {
-    pub(super) fn init(edges: Edges, channels: usize, init: &mut Init<impl Rng>) -> Self {
-        let [a, b, c, d] = WIDTHS;
+    pub(super) fn init(
+        edges: Edges,
+        [a, b, c, d]: [usize; 4],
+        channels: usize,
+        init: &mut Init<impl Rng>,
+    ) -> Self {
         // A layer on the features of points sees an edge's two.
         let ends = if edges == Edges::Dynamic { 2 } else { 1 };
         Self {
