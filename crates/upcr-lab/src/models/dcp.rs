@@ -1,7 +1,6 @@
 //! Deep closest point (Wang & Solomon, ICCV 2019): soft matches of learned features, and the pose that fits them.
 
 use burn::module::Module;
-use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -14,6 +13,7 @@ use super::dgcnn::{DEFAULT_K, DEFAULT_WIDTHS, Dgcnn, Edges, check_k};
 use super::layers::{Init, Statistics, check_channels};
 use super::procrustes;
 use super::truth::Truth;
+use crate::ops::attention;
 
 /// A DCP network. The default is the paper's DCP-v2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -160,7 +160,8 @@ fn soft_pose(
     source: Tensor<3>,
     target: Tensor<3>,
 ) -> (Tensor<3>, Tensor<2>) {
-    let partners = softmax(likeness(source, target), 2).matmul(target_points.clone());
+    let scale = 1.0 / (source.dims()[2] as f32).sqrt();
+    let partners = attention(source, target, target_points.clone(), 1, scale);
     pose_of_matches(source_points.clone(), partners)
 }
 

@@ -92,7 +92,7 @@ impl PrnetConfig {
         let mut init = Init::new(rng, device);
         Prnet {
             emb_nn: Dgcnn::init(Edges::Dynamic, self.widths, self.attention.channels, &mut init),
-            attention: Transformer::init(&self.attention, f64::from(NEGATIVE_SLOPE), &mut init),
+            attention: Transformer::init(&self.attention, NEGATIVE_SLOPE, &mut init),
             temp_net: TemperatureNet::init(self.attention.channels, &mut init),
             config: self.clone(),
         }
