@@ -187,10 +187,14 @@ fn softmax(rows: &mut [f32], scale: f32, logarithms: &mut [f32]) {
     let keys = rows.len() / logarithms.len();
     for (row, logarithm) in rows.chunks_exact_mut(keys).zip(logarithms) {
         let largest = lanes(row, f32::NEG_INFINITY, |value| value * scale, f32::max);
-        row.iter_mut().for_each(|value| *value = exponential(*value * scale - largest));
+        for value in row.iter_mut() {
+            *value = exponential(*value * scale - largest);
+        }
         let sum = lanes(row, 0.0, |value| value, |a, b| a + b);
         let inverse = sum.recip();
-        row.iter_mut().for_each(|value| *value *= inverse);
+        for value in row {
+            *value *= inverse;
+        }
         *logarithm = largest + sum.ln();
     }
 }

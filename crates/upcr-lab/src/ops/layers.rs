@@ -131,7 +131,7 @@ fn tracked<C: CheckpointStrategy, const N: usize>(
     back: impl Fn(&[f32], [bool; N]) -> [Vec<f32>; N] + Send + Sync + 'static,
 ) -> FloatTensor<Autodiff<Flex, C>> {
     let shapes = inputs.map(|input| input.primitive().layout().shape().to_vec());
-    match Step.prepare::<C>(inputs.map(|input| input.node())).compute_bound().stateful() {
+    match Step.prepare::<C>(inputs.map(FloatTensor::<Autodiff<Flex, C>>::node)).compute_bound().stateful() {
         OpsKind::Tracked(node) => node.finish(Kept((Arc::new(back), shapes)), out),
         OpsKind::UnTracked(node) => node.finish(out),
     }

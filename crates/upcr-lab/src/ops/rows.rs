@@ -163,7 +163,9 @@ fn block_moments(x: &[f32], channels: usize) -> [Vec<f32>; 2] {
         mean.iter_mut().zip(row).for_each(|(mean, x)| *mean += x);
     }
     let share = channels as f32 / x.len() as f32;
-    mean.iter_mut().for_each(|mean| *mean *= share);
+    for mean in &mut mean {
+        *mean *= share;
+    }
     for row in x.chunks_exact(channels) {
         for ((squares, x), mean) in squares.iter_mut().zip(row).zip(&mean) {
             *squares += (x - mean) * (x - mean);

@@ -284,8 +284,11 @@ fn layers_give_the_same_bits_on_any_number_of_threads() {
     assert_eq!(run(1), run(3));
 }
 
+/// An input's gradient.
+type Slope<'a> = &'a dyn Fn(&Gradients) -> Vec<f32>;
+
 /// Values of an operation, and the gradients of a weighted sum of them with respect to its inputs.
-fn slopes<const D: usize>(out: Tensor<D>, gradients: &[&dyn Fn(&Gradients) -> Vec<f32>]) -> Vec<Vec<f32>> {
+fn slopes<const D: usize>(out: Tensor<D>, gradients: &[Slope]) -> Vec<Vec<f32>> {
     let shape = out.dims();
     let weights = uniform(&mut random::stream(99, 0), shape.iter().product());
     let found = (out.clone() * tensor(weights, shape)).sum().backward();
@@ -321,7 +324,7 @@ fn attention_is_its_tensor_form() {
         let queries = leaf([batch, points, channels], &mut rng);
         let keys = leaf([batch, others, channels], &mut rng);
         let sought = leaf([batch, others, width], &mut rng);
-        let gradients: [&dyn Fn(&Gradients) -> Vec<f32>; 3] = [&of(&queries), &of(&keys), &of(&sought)];
+        let gradients: [Slope; 3] = [&of(&queries), &of(&keys), &of(&sought)];
         let inputs = || (queries.clone(), keys.clone(), sought.clone());
         let (q, k, v) = inputs();
         let found = slopes(layers::attention(q, k, v, heads, scale), &gradients);
@@ -338,7 +341,7 @@ fn maps_and_norms_of_rows_are_their_tensor_forms() {
         let x = leaf([rows, inputs], &mut rng);
         let weight = leaf([outputs, inputs], &mut rng);
         let [scale, shift] = [outputs, outputs].map(|length| leaf([length], &mut rng));
-        let gradients: [&dyn Fn(&Gradients) -> Vec<f32>; 3] = [&of(&x), &of(&weight), &of(&shift)];
+        let gradients: [Slope; 3] = [&of(&x), &of(&weight), &of(&shift)];
         let inputs = || (x.clone(), weight.clone(), shift.clone());
         let (a, b, c) = inputs();
         let found = slopes(layers::dense(a, b, c, slope), &gradients);
@@ -348,7 +351,7 @@ fn maps_and_norms_of_rows_are_their_tensor_forms() {
         // Far from zero, where squares alone would tell little of the variance.
         let x = tensor(uniform(&mut rng, rows * outputs).iter().map(|v| v + 30.0).collect(), [rows, outputs]);
         let x = x.require_grad();
-        let gradients: [&dyn Fn(&Gradients) -> Vec<f32>; 3] = [&of(&x), &of(&scale), &of(&shift)];
+        let gradients: [Slope; 3] = [&of(&x), &of(&scale), &of(&shift)];
         let inputs = || (x.clone(), scale.clone(), shift.clone());
         if rows > 2 {
             let (a, b, c) = inputs();
