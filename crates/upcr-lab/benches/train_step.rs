@@ -1,12 +1,14 @@
-//! One training step of the paper's network: forward, loss, backward, Adam. Prints a JSON object; the arguments are
+//! One training step of a network, the paper's where none is named: forward, loss, backward, Adam. Prints a JSON object; the arguments are
 //! pairs, points and repeats, then, if wanted, neighbours and by what to divide the widths. `bench/train_step.py` holds
-//! it against a plain PyTorch form.
+//! it against a plain PyTorch form. With another network's name before the numbers, that network in a quarter of its width
+//! takes the steps.
 #![allow(missing_docs, clippy::print_stdout, clippy::unwrap_used)]
 
 use std::time::Instant;
 
 use upcr::{Rigid, net::NetworkConfig};
 use upcr_lab::Device;
+use upcr_lab::models::learned::NETWORKS;
 use upcr_lab::models::{Batch, LearnedConfig};
 use upcr_lab::random;
 use upcr_lab::train::{Trainer, TrainingConfig};
@@ -15,9 +17,10 @@ use upcr_lab::train::{Trainer, TrainingConfig};
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 fn main() {
+    let name = std::env::args().find(|arg| NETWORKS.contains(&arg.as_str()));
     let numbers: Vec<usize> = std::env::args().filter_map(|arg| arg.parse().ok()).collect();
     let [pairs, points, repeats, ref narrower @ ..] = *numbers else {
-        println!("{{\"usage\": \"train_step PAIRS POINTS REPEATS [K [DIVISOR]]\"}}");
+        println!("{{\"usage\": \"train_step [NETWORK] PAIRS POINTS REPEATS [K [DIVISOR]]\"}}");
         return;
     };
     let mut config = TrainingConfig::default();
@@ -25,7 +28,12 @@ fn main() {
     network.k = narrower.first().copied().unwrap_or(network.k);
     let divisor = narrower.get(1).copied().unwrap_or(1);
     network.widths.iter_mut().chain(&mut network.head).for_each(|width| *width /= divisor);
-    config.network = LearnedConfig::Upcr(network);
+    config.network = match name {
+        Some(name) => {
+            LearnedConfig::by_name(&name).unwrap().narrow().with_neighbors(narrower.first().copied())
+        }
+        None => LearnedConfig::Upcr(network),
+    };
     let mut rng = random::stream(1, 0);
     let mut cloud = || -> Vec<[f32; 3]> {
         (0..points).map(|_| random::direction(&mut rng).map(|v| v as f32).into()).collect()
@@ -44,9 +52,10 @@ fn main() {
         .collect();
     times_ms.sort_by(f64::total_cmp);
     println!(
-        "{{\"pairs\": {pairs}, \"points\": {points}, \"ms_median\": {:.2}, \"ms_min\": {:.2}, \"threads\": {}}}",
+        "{{\"pairs\": {pairs}, \"points\": {points}, \"ms_median\": {:.2}, \"ms_min\": {:.2}, \"clouds_per_second\": {:.1}, \"threads\": {}}}",
         times_ms[times_ms.len() / 2],
         times_ms[0],
+        2e3 * pairs as f64 / times_ms[times_ms.len() / 2],
         rayon::current_num_threads()
     );
 }

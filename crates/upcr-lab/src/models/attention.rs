@@ -2,13 +2,13 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
-use burn::tensor::activation::{leaky_relu, softmax};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
 use upcr::{Error, Result};
 
 use super::dense::Dense;
 use super::layers::{Init, check_channels};
+use crate::ops;
 
 /// Sizes of a transformer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -55,7 +55,7 @@ pub struct Transformer {
 
 impl Transformer {
     /// `negative_slope` is that of the rectifiers for negative values.
-    pub(super) fn init(config: &TransformerConfig, negative_slope: f64, init: &mut Init<impl Rng>) -> Self {
+    pub(super) fn init(config: &TransformerConfig, negative_slope: f32, init: &mut Init<impl Rng>) -> Self {
         let norm = |init: &mut Init<_>| LayerNorm::init(config.channels, init);
         let encoder = Encoder {
             layers: (0..config.blocks).map(|_| EncoderLayer::init(config, negative_slope, init)).collect(),
@@ -128,7 +128,7 @@ pub struct EncoderLayer {
 }
 
 impl EncoderLayer {
-    fn init(config: &TransformerConfig, negative_slope: f64, init: &mut Init<impl Rng>) -> Self {
+    fn init(config: &TransformerConfig, negative_slope: f32, init: &mut Init<impl Rng>) -> Self {
         Self {
             self_attn: Attention::init(config, init),
             feed_forward: FeedForward::init(config, negative_slope, init),
@@ -156,7 +156,7 @@ pub struct DecoderLayer {
 }
 
 impl DecoderLayer {
-    fn init(config: &TransformerConfig, negative_slope: f64, init: &mut Init<impl Rng>) -> Self {
+    fn init(config: &TransformerConfig, negative_slope: f32, init: &mut Init<impl Rng>) -> Self {
         Self {
             self_attn: Attention::init(config, init),
             src_attn: Attention::init(config, init),
@@ -198,21 +198,15 @@ pub struct LayerNorm {
     pub b_2: Param<Tensor<1>>,
 }
 
-/// What a layer norm adds to a standard deviation.
-const EPSILON: f64 = 1e-6;
-
 impl LayerNorm {
     fn init(channels: usize, init: &mut Init<impl Rng>) -> Self {
         Self { a_2: init.filled(1.0, channels), b_2: init.filled(0.0, channels) }
     }
 
     fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let channels = x.dims()[2] as f64;
-        let centered = x.clone() - x.mean_dim(2);
-        let variance = centered.clone().square().sum_dim(2) / (channels - 1.0).max(1.0);
-        // The square root of zero has no gradient.
-        let deviation = (variance + EPSILON * EPSILON).sqrt() + EPSILON;
-        centered / deviation * self.a_2.val().unsqueeze() + self.b_2.val().unsqueeze()
+        let [batch, points, channels] = x.dims();
+        let rows = x.reshape([batch * points, channels]);
+        ops::layer_norm(rows, self.a_2.val(), self.b_2.val()).reshape([batch, points, channels])
     }
 }
 
@@ -234,18 +228,10 @@ impl Attention {
 
     /// `[batch, points, channels]` of those who ask, and of those who are asked.
     fn forward(&self, queries: Tensor<3>, memory: &Tensor<3>) -> Tensor<3> {
-        let [batch, points, channels] = queries.dims();
-        let heads = |x: Tensor<3>, linear: usize| -> Tensor<4> {
-            let points = x.dims()[1];
-            let x = self.linears[linear].forward_batch(x);
-            x.reshape([batch, points, self.heads, channels / self.heads]).swap_dims(1, 2)
-        };
-        let queries = heads(queries, 0);
-        let (keys, values) = (heads(memory.clone(), 1), heads(memory.clone(), 2));
-        let scale = 1.0 / ((channels / self.heads) as f64).sqrt();
-        let weights = softmax(queries.matmul(keys.transpose()) * scale, 3);
-        let joined = weights.matmul(values).swap_dims(1, 2).reshape([batch, points, channels]);
-        self.linears[3].forward_batch(joined)
+        let scale = 1.0 / ((queries.dims()[2] / self.heads) as f32).sqrt();
+        let queries = self.linears[0].forward_batch(queries);
+        let [keys, values] = [1, 2].map(|map| self.linears[map].forward_batch(memory.clone()));
+        self.linears[3].forward_batch(ops::attention(queries, keys, values, self.heads, scale))
     }
 }
 
@@ -258,11 +244,11 @@ pub struct FeedForward {
     pub w_2: Dense,
     /// Of the rectifier between them.
     #[module(skip)]
-    pub negative_slope: f64,
+    pub negative_slope: f32,
 }
 
 impl FeedForward {
-    fn init(config: &TransformerConfig, negative_slope: f64, init: &mut Init<impl Rng>) -> Self {
+    fn init(config: &TransformerConfig, negative_slope: f32, init: &mut Init<impl Rng>) -> Self {
         Self {
             w_1: Dense::init(config.channels, config.inner, init),
             w_2: Dense::init(config.inner, config.channels, init),
@@ -271,6 +257,6 @@ impl FeedForward {
     }
 
     fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        self.w_2.forward_batch(leaky_relu(self.w_1.forward_batch(x), self.negative_slope))
+        self.w_2.forward_batch(self.w_1.rectified_batch(x, self.negative_slope))
     }
 }

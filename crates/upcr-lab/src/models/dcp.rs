@@ -1,7 +1,6 @@
 //! Deep closest point (Wang & Solomon, ICCV 2019): soft matches of learned features, and the pose that fits them.
 
 use burn::module::Module;
-use burn::tensor::activation::softmax;
 use burn::tensor::{Device, Tensor};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -10,10 +9,11 @@ use upcr::Result;
 
 use super::attention::{Transformer, TransformerConfig};
 use super::dense::BatchStatistics;
-use super::dgcnn::{DEFAULT_K, Dgcnn, Edges, check_k};
+use super::dgcnn::{DEFAULT_K, DEFAULT_WIDTHS, Dgcnn, Edges, check_k};
 use super::layers::{Init, Statistics, check_channels};
 use super::procrustes;
 use super::truth::Truth;
+use crate::ops::attention;
 
 /// A DCP network. The default is the paper's DCP-v2.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,6 +21,8 @@ use super::truth::Truth;
 pub struct DcpConfig {
     /// Neighbours of a point, itself included.
     pub k: usize,
+    /// Channels after each of the point feature's first four layers.
+    pub widths: [usize; 4],
     /// Channels of a point's feature.
     pub channels: usize,
     /// The transformer of DCP-v2; DCP-v1 has none, nor a file that tells none.
@@ -31,7 +33,7 @@ pub struct DcpConfig {
 impl Default for DcpConfig {
     fn default() -> Self {
         let pointer = TransformerConfig { channels: 512, heads: 4, blocks: 1, inner: 1024 };
-        Self { k: DEFAULT_K, channels: 512, pointer: Some(pointer) }
+        Self { k: DEFAULT_K, widths: DEFAULT_WIDTHS, channels: 512, pointer: Some(pointer) }
     }
 }
 
@@ -47,6 +49,7 @@ impl DcpConfig {
     /// Where a number is out of its range.
     pub fn check(&self) -> Result<()> {
         check_k(self.k)?;
+        self.widths.into_iter().try_for_each(check_channels)?;
         check_channels(self.channels)?;
         match &self.pointer {
             Some(pointer) => pointer.check(self.channels),
@@ -59,7 +62,7 @@ impl DcpConfig {
         let mut init = Init::new(rng, device);
         Dcp {
             config: self.clone(),
-            emb_nn: Dgcnn::init(Edges::Kept, self.channels, &mut init),
+            emb_nn: Dgcnn::init(Edges::Kept, self.widths, self.channels, &mut init),
             pointer: self.pointer.map(|config| Transformer::init(&config, 0.0, &mut init)),
         }
     }
@@ -171,7 +174,8 @@ fn soft_pose(
     source: Tensor<3>,
     target: Tensor<3>,
 ) -> (Tensor<3>, Tensor<2>) {
-    let partners = softmax(likeness(source, target), 2).matmul(target_points.clone());
+    let scale = 1.0 / (source.dims()[2] as f32).sqrt();
+    let partners = attention(source, target, target_points.clone(), 1, scale);
     pose_of_matches(source_points.clone(), partners)
 }
 

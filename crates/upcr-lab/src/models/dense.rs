@@ -5,6 +5,7 @@ use burn::tensor::Tensor;
 use rand::Rng;
 
 use super::layers::{Init, Statistics, towards};
+use crate::ops;
 
 /// A linear map of channels: PyTorch's `Linear`, and its convolutions over single points.
 #[derive(Module, Debug)]
@@ -26,17 +27,31 @@ impl Dense {
 
     /// `[rows, inputs]` → `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        let y = x.matmul(self.weight.val().transpose());
+        self.rectified(x, 1.0)
+    }
+
+    /// The same, rectified with that slope for negative values (1: not at all).
+    pub fn rectified(&self, x: Tensor<2>, slope: f32) -> Tensor<2> {
+        ops::dense(x, self.weight.val(), self.shift(), slope)
+    }
+
+    /// The bias, or none.
+    fn shift(&self) -> Tensor<1> {
         match &self.bias {
-            Some(bias) => y + bias.val().unsqueeze(),
-            None => y,
+            Some(bias) => bias.val(),
+            None => Tensor::zeros([self.weight.dims()[0]], &self.weight.device()),
         }
     }
 
     /// `[batch, rows, inputs]` → `[batch, rows, outputs]`.
     pub fn forward_batch(&self, x: Tensor<3>) -> Tensor<3> {
+        self.rectified_batch(x, 1.0)
+    }
+
+    /// The same, rectified with that slope for negative values (1: not at all).
+    pub fn rectified_batch(&self, x: Tensor<3>, slope: f32) -> Tensor<3> {
         let [batch, rows, inputs] = x.dims();
-        let y = self.forward(x.reshape([batch * rows, inputs]));
+        let y = self.rectified(x.reshape([batch * rows, inputs]), slope);
         let outputs = y.dims()[1];
         y.reshape([batch, rows, outputs])
     }
@@ -70,21 +85,50 @@ impl BatchNorm {
 
     /// `[rows, channels]`, normalised by the running statistics or by the batch's, which are added to `found`.
     pub fn forward(&self, x: Tensor<2>, statistics: Statistics, found: &mut BatchStatistics) -> Tensor<2> {
-        let (mean, variance) = match statistics {
-            Statistics::Running => (self.running_mean.val().unsqueeze(), self.running_var.val().unsqueeze()),
-            Statistics::Batch => {
-                let rows = x.dims()[0] as f64;
-                let mean = x.clone().mean_dim(0);
-                let variance = (x.clone() - mean.clone()).square().mean_dim(0);
-                // The running variance is the unbiased one.
-                let unbiased = variance.clone().detach() * (rows / (rows - 1.0).max(1.0));
-                let channels = x.dims()[1];
-                found.push([mean.clone().detach().reshape([channels]), unbiased.reshape([channels])]);
-                (mean, variance)
+        match statistics {
+            Statistics::Batch => self.by_batch(x, 1.0, found),
+            Statistics::Running => {
+                let [scale, shift] = self.running();
+                x * scale.unsqueeze() + shift.unsqueeze()
             }
-        };
-        let scale: Tensor<2> = (variance + EPSILON).sqrt().recip() * self.weight.val().unsqueeze();
-        (x - mean) * scale + self.bias.val().unsqueeze()
+        }
+    }
+
+    /// Rows through `map`, normalised, and rectified with that slope for negative values.
+    pub fn after(
+        &self,
+        map: &Dense,
+        x: Tensor<2>,
+        slope: f32,
+        statistics: Statistics,
+        found: &mut BatchStatistics,
+    ) -> Tensor<2> {
+        match statistics {
+            Statistics::Batch => self.by_batch(map.forward(x), slope, found),
+            // Two affine maps are one.
+            Statistics::Running => {
+                let [scale, shift] = self.running();
+                let outputs = scale.dims()[0];
+                let weight = map.weight.val() * scale.clone().reshape([outputs, 1]);
+                ops::dense(x, weight, map.shift() * scale + shift, slope)
+            }
+        }
+    }
+
+    fn by_batch(&self, x: Tensor<2>, slope: f32, found: &mut BatchStatistics) -> Tensor<2> {
+        let rows = x.dims()[0] as f64;
+        let normalized = ops::batch_norm(x, self.weight.val(), self.bias.val(), slope);
+        let [mean, variance] = normalized.statistics;
+        // The running variance is the unbiased one.
+        found.push([mean, variance * (rows / (rows - 1.0).max(1.0))]);
+        normalized.values
+    }
+
+    /// Scale and shift by the running statistics.
+    fn running(&self) -> [Tensor<1>; 2] {
+        let scale = (self.running_var.val() + EPSILON).sqrt().recip() * self.weight.val();
+        let shift = self.bias.val() - self.running_mean.val() * scale.clone();
+        [scale, shift]
     }
 
     /// The norm with its running statistics moved by `share` towards the next of a batch's.

@@ -3,20 +3,18 @@
 use std::sync::Arc;
 
 use burn::module::Module;
-use burn::tensor::activation::{leaky_relu, relu};
 use burn::tensor::{Int, Tensor, TensorData};
 use rand::Rng;
-use upcr::net::Graph;
 use upcr::{Error, Result};
 
 use super::dense::{BatchNorm, BatchStatistics, Dense};
 use super::layers::{Init, Statistics};
-use crate::ops::{BatchGraph, Normalized, NormalizedMap, graph_layer};
+use crate::ops::{BatchGraph, Normalized, NormalizedMap, graph_layer, group_max, nearest_features};
 
 /// Neighbours of a point, itself included, as published.
 pub const DEFAULT_K: usize = 20;
-/// Channels after each of the first four layers, which the fifth reads together.
-const WIDTHS: [usize; 4] = [64, 64, 128, 256];
+/// Channels after each of the first four layers, which the fifth reads together, as published.
+pub const DEFAULT_WIDTHS: [usize; 4] = [64, 64, 128, 256];
 /// Slope of PRNet's rectifiers for negative values.
 pub(super) const NEGATIVE_SLOPE: f32 = 0.2;
 
@@ -57,8 +55,12 @@ pub struct Dgcnn {
 }
 
 impl Dgcnn {
-    pub(super) fn init(edges: Edges, channels: usize, init: &mut Init<impl Rng>) -> Self {
-        let [a, b, c, d] = WIDTHS;
+    pub(super) fn init(
+        edges: Edges,
+        [a, b, c, d]: [usize; 4],
+        channels: usize,
+        init: &mut Init<impl Rng>,
+    ) -> Self {
         // A layer on the features of points sees an edge's two.
         let ends = if edges == Edges::Dynamic { 2 } else { 1 };
         Self {
@@ -88,13 +90,13 @@ impl Dgcnn {
         let rows = points.clone().reshape([clouds * count, 3]);
         let features = match self.edges {
             Edges::Kept => self.on_kept_edges(rows, [clouds, count], k, statistics, found),
-            Edges::Dynamic => self.on_dynamic_edges(rows, [clouds, count], k, statistics, found),
+            Edges::Dynamic => self.on_dynamic_edges(rows, count, k, statistics, found),
         };
-        let joined = self.bn5.forward(self.conv5.forward(Tensor::cat(features, 1)), statistics, found);
-        let joined = match self.edges {
-            Edges::Kept => relu(joined),
-            Edges::Dynamic => leaky_relu(joined, f64::from(NEGATIVE_SLOPE)),
+        let slope = match self.edges {
+            Edges::Kept => 0.0,
+            Edges::Dynamic => NEGATIVE_SLOPE,
         };
+        let joined = self.bn5.after(&self.conv5, Tensor::cat(features, 1), slope, statistics, found);
         let channels = joined.dims()[1];
         joined.reshape([clouds, count, channels])
     }
@@ -116,7 +118,7 @@ impl Dgcnn {
         statistics: Statistics,
         found: &mut BatchStatistics,
     ) -> Vec<Tensor<2>> {
-        let graph = graph_of(&points, [clouds, count], k);
+        let graph = graph_of(&points, count, k);
         let k = graph.k;
         let device = points.device();
         let starts = (0..clouds).flat_map(|cloud| std::iter::repeat_n(cloud * count, count * k));
@@ -127,13 +129,8 @@ impl Dgcnn {
             points.reshape([clouds * count, 1, 3]).repeat_dim(1, k).reshape([clouds * count * k, 3]);
         let mut edges = Tensor::cat(vec![neighbors, centers], 1);
         let layers = self.layers().map(|(map, norm)| {
-            edges = relu(norm.forward(map.forward(edges.clone()), statistics, found));
-            let channels = edges.dims()[1];
-            edges
-                .clone()
-                .reshape([clouds * count, k, channels])
-                .max_dim(1)
-                .reshape([clouds * count, channels])
+            edges = norm.after(map, edges.clone(), 0.0, statistics, found);
+            group_max(edges.clone(), k)
         });
         layers.to_vec()
     }
@@ -141,14 +138,14 @@ impl Dgcnn {
     fn on_dynamic_edges(
         &self,
         points: Tensor<2>,
-        sizes: [usize; 2],
+        count: usize,
         k: usize,
         statistics: Statistics,
         found: &mut BatchStatistics,
     ) -> Vec<Tensor<2>> {
         let mut features = points;
         let layers = self.layers().map(|(map, norm)| {
-            let graph = Arc::new(graph_of(&features, sizes, k));
+            let graph = Arc::new(graph_of(&features, count, k));
             let inputs = features.dims()[1];
             // The published map is one of [Fⱼ ; Fᵢ], that of a graph layer of [Fᵢ ; Fⱼ − Fᵢ].
             let weight = map.weight.val().transpose();
@@ -194,26 +191,8 @@ impl Dgcnn {
 
 /// The nearest neighbours of every row among those of its cloud, itself included. Squared distances are computed as the
 /// published code does, from inner products in single precision: where two are nearly equal, its choice is made.
-fn graph_of(rows: &Tensor<2>, [clouds, count]: [usize; 2], k: usize) -> BatchGraph {
+fn graph_of(rows: &Tensor<2>, count: usize, k: usize) -> BatchGraph {
     let channels = rows.dims()[1];
-    let x = rows.clone().detach().reshape([clouds, count, channels]);
-    let squares = x.clone().square().sum_dim(2);
-    let distances_sq = squares.clone() - x.clone().matmul(x.transpose()) * 2.0 + squares.transpose();
-    let distances_sq: Vec<f32> = distances_sq.into_data().iter::<f32>().collect();
-    let k = k.min(count);
-    let nearest = |row: &[f32]| {
-        let mut order: Vec<u32> = (0..count as u32).collect();
-        let by_distance = |a: &u32, b: &u32| row[*a as usize].total_cmp(&row[*b as usize]).then(a.cmp(b));
-        if k < count {
-            order.select_nth_unstable_by(k, by_distance);
-            order.truncate(k);
-        }
-        order.sort_unstable_by(by_distance);
-        order
-    };
-    let graphs: Vec<Graph> = distances_sq
-        .chunks_exact(count * count)
-        .map(|cloud| Graph { k, neighbors: cloud.chunks_exact(count).flat_map(nearest).collect() })
-        .collect();
-    BatchGraph::new(&graphs, k)
+    let features: Vec<f32> = rows.clone().detach().into_data().iter::<f32>().collect();
+    nearest_features(&features, count, channels, k)
 }

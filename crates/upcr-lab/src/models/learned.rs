@@ -100,13 +100,16 @@ impl LearnedConfig {
                 ..config.clone()
             }),
             Self::Dcp(config) => Self::Dcp(DcpConfig {
+                widths: config.widths.map(|width| width / 4),
                 channels: config.channels / 4,
                 pointer: config.pointer.as_ref().map(narrow),
                 ..config.clone()
             }),
-            Self::Prnet(config) => {
-                Self::Prnet(PrnetConfig { attention: narrow(&config.attention), ..config.clone() })
-            }
+            Self::Prnet(config) => Self::Prnet(PrnetConfig {
+                widths: config.widths.map(|width| width / 4),
+                attention: narrow(&config.attention),
+                ..config.clone()
+            }),
             Self::PointNetLk(config) => Self::PointNetLk(PointNetLkConfig {
                 widths: config.widths.map(|width| width / 4),
                 ..config.clone()
@@ -397,20 +400,25 @@ impl Learned {
             Ok(TransformerConfig { channels, heads: 4, blocks, inner: outputs(&layer(0))? })
         };
         let begins = |prefix: &str| file.tensors.keys().any(|name| name.starts_with(prefix));
-        let config = if begins("feature_model.") {
+        let maps = |prefix: &str| -> Result<[usize; 5]> {
             let mut widths = [0; 5];
             for (l, width) in widths.iter_mut().enumerate() {
-                *width = outputs(&format!("feature_model.conv{}.weight", l + 1))?;
+                *width = outputs(&format!("{prefix}.conv{}.weight", l + 1))?;
             }
+            Ok(widths)
+        };
+        let config = if begins("feature_model.") {
+            let widths = maps("feature_model")?;
             LearnedConfig::PointNetLk(PointNetLkConfig { widths, ..PointNetLkConfig::default() })
         } else {
-            let channels = outputs("emb_nn.conv5.weight")?;
+            let [a, b, c, d, channels] = maps("emb_nn")?;
+            let widths = [a, b, c, d];
             if begins("temp_net.") {
                 let attention = transformer("attention", channels)?;
-                LearnedConfig::Prnet(PrnetConfig { attention, ..PrnetConfig::default() })
+                LearnedConfig::Prnet(PrnetConfig { widths, attention, ..PrnetConfig::default() })
             } else {
                 let pointer = begins("pointer.").then(|| transformer("pointer", channels)).transpose()?;
-                LearnedConfig::Dcp(DcpConfig { channels, pointer, ..DcpConfig::default() })
+                LearnedConfig::Dcp(DcpConfig { widths, channels, pointer, ..DcpConfig::default() })
             }
         };
         named::filled(config.init(0, device)?, file, path, str::to_owned)

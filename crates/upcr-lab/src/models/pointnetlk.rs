@@ -2,7 +2,6 @@
 //! compositional, its Jacobian by finite differences.
 
 use burn::module::{Module, Param};
-use burn::tensor::activation::relu;
 use burn::tensor::{Device, Tensor};
 use rand::Rng;
 use serde::{Deserialize, Serialize};
@@ -12,6 +11,7 @@ use super::dense::{BatchNorm, BatchStatistics, Dense};
 use super::layers::{Init, Statistics, check_channels};
 use super::procrustes::cross_matrix;
 use super::truth::Truth;
+use crate::ops::group_max;
 
 /// A PointNetLK network. The default is the paper's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -240,10 +240,9 @@ impl PointNet {
         ];
         let mut x = points.clone().reshape([clouds * count, 3]);
         for (map, norm) in layers {
-            x = relu(norm.forward(map.forward(x), statistics, found));
+            x = norm.after(map, x, 0.0, statistics, found);
         }
-        let channels = x.dims()[1];
-        x.reshape([clouds, count, channels]).max_dim(1).reshape([clouds, channels])
+        group_max(x, count)
     }
 
     fn observed<'a>(self, batch: &mut impl Iterator<Item = &'a [Tensor<1>; 2]>, share: f64) -> Self {

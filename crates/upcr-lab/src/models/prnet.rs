@@ -11,8 +11,8 @@ use upcr::{Error, Result};
 use super::attention::{Transformer, TransformerConfig};
 use super::dcp::{likeness, pose_of_matches};
 use super::dense::{BatchNorm, BatchStatistics, Dense};
-use super::dgcnn::{DEFAULT_K, Dgcnn, Edges, NEGATIVE_SLOPE, check_k};
-use super::layers::{Init, Statistics};
+use super::dgcnn::{DEFAULT_K, DEFAULT_WIDTHS, Dgcnn, Edges, NEGATIVE_SLOPE, check_k};
+use super::layers::{Init, Statistics, check_channels};
 use super::truth::Truth;
 
 /// Bounds of the temperature's inverse.
@@ -31,6 +31,8 @@ const INNER: usize = 128;
 pub struct PrnetConfig {
     /// Neighbours of a point, itself included.
     pub k: usize,
+    /// Channels after each of the point feature's first four layers.
+    pub widths: [usize; 4],
     /// The transformer, and channels of a point's feature.
     pub attention: TransformerConfig,
     /// Share of each cloud's points that are matched; 1 in PRNet*.
@@ -55,7 +57,14 @@ pub enum Sampler {
 impl Default for PrnetConfig {
     fn default() -> Self {
         let attention = TransformerConfig { channels: 512, heads: 4, blocks: 1, inner: 1024 };
-        Self { k: DEFAULT_K, attention, keypoints: 0.5, passes: 3, sampler: Sampler::default() }
+        Self {
+            k: DEFAULT_K,
+            widths: DEFAULT_WIDTHS,
+            attention,
+            keypoints: 0.5,
+            passes: 3,
+            sampler: Sampler::default(),
+        }
     }
 }
 
@@ -66,6 +75,7 @@ impl PrnetConfig {
     /// Where a number is out of its range.
     pub fn check(&self) -> Result<()> {
         check_k(self.k)?;
+        self.widths.into_iter().try_for_each(check_channels)?;
         self.attention.check(self.attention.channels)?;
         let refused = |name, reason: &str| Err(Error::InvalidSetting { name, reason: reason.into() });
         if !(self.keypoints > 0.0 && self.keypoints <= 1.0) {
@@ -81,8 +91,8 @@ impl PrnetConfig {
     pub fn init(&self, rng: &mut impl Rng, device: &Device) -> Prnet {
         let mut init = Init::new(rng, device);
         Prnet {
-            emb_nn: Dgcnn::init(Edges::Dynamic, self.attention.channels, &mut init),
-            attention: Transformer::init(&self.attention, f64::from(NEGATIVE_SLOPE), &mut init),
+            emb_nn: Dgcnn::init(Edges::Dynamic, self.widths, self.attention.channels, &mut init),
+            attention: Transformer::init(&self.attention, NEGATIVE_SLOPE, &mut init),
             temp_net: TemperatureNet::init(self.attention.channels, &mut init),
             config: self.clone(),
         }

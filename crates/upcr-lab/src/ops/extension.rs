@@ -74,7 +74,7 @@ pub fn canonical_chamfer(
     Tensor::from_dispatch(Dispatch::canonical_chamfer(rotations, translations, Data(clouds.clone())))
 }
 
-fn on_cpu(device: &Device) -> bool {
+pub(super) fn on_cpu(device: &Device) -> bool {
     device.clone().inner() == Device::flex()
 }
 
@@ -88,7 +88,7 @@ fn dispatched(map: NormalizedMap) -> [FloatTensor<Dispatch>; 3] {
     [map.weight.into_dispatch(), map.gamma.into_dispatch(), map.beta.into_dispatch()]
 }
 
-fn normalized(out: LayerOutput<Dispatch>) -> Normalized {
+pub(super) fn normalized(out: LayerOutput<Dispatch>) -> Normalized {
     Normalized {
         values: Tensor::from_dispatch(out.values),
         statistics: [Tensor::from_dispatch(out.mean), Tensor::from_dispatch(out.variance)],
@@ -152,12 +152,12 @@ pub trait CloudOperations: Backend {
 }
 
 /// A tensor of the CPU backend that takes over `values`.
-fn tensor(values: Vec<f32>, shape: &[usize]) -> FlexTensor {
+pub(super) fn tensor(values: Vec<f32>, shape: &[usize]) -> FlexTensor {
     let layout = Layout::contiguous(Shape::from(shape.to_vec()));
     FlexTensor::new(Bytes::from_elems(values), layout, DType::F32)
 }
 
-fn values(tensor: &FlexTensor) -> &[f32] {
+pub(super) fn values(tensor: &FlexTensor) -> &[f32] {
     // Networks here are single precision, and every tensor was made contiguous where it came in.
     tensor.as_slice::<f32>().unwrap_or_default()
 }
@@ -251,7 +251,7 @@ impl CloudOperations for Flex {
 
 /// State of an operation on its way back, of which nothing is worth printing.
 #[derive(Clone)]
-struct Kept<T>(T);
+pub(super) struct Kept<T>(pub T);
 
 impl<T> fmt::Debug for Kept<T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

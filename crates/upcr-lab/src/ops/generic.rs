@@ -5,7 +5,7 @@
 // Tensors are handles, which the framework passes by value.
 #![allow(clippy::needless_pass_by_value)]
 
-use burn::tensor::activation::leaky_relu;
+use burn::tensor::activation::{leaky_relu, softmax};
 use burn::tensor::{Device, Int, Tensor, TensorData};
 
 use super::batch::BatchGraph;
@@ -13,6 +13,7 @@ use super::canonical_chamfer::PairPoints;
 use super::edge_embed::EdgeInputs;
 use super::graph_layer::EPSILON;
 use super::normalized::{Normalized, NormalizedMap};
+use super::rows::DEVIATION_EPSILON;
 
 /// Rows of the edges' neighbours, counted over the batch.
 fn neighbor_rows(graph: &BatchGraph, device: &Device) -> Tensor<1, Int> {
@@ -115,4 +116,54 @@ pub(super) fn canonical_chamfer(
         distances_sq.clone().min_dim(1).mean() + distances_sq.min_dim(0).mean()
     });
     Tensor::cat(pairs.collect(), 0)
+}
+
+pub(super) fn attention(
+    queries: Tensor<3>,
+    keys: Tensor<3>,
+    values: Tensor<3>,
+    heads: usize,
+    scale: f32,
+) -> Tensor<3> {
+    let split = |x: Tensor<3>| -> Tensor<4> {
+        let [batch, points, channels] = x.dims();
+        x.reshape([batch, points, heads, channels / heads]).swap_dims(1, 2)
+    };
+    let ([batch, points, _], [.., width]) = (queries.dims(), values.dims());
+    let shares = softmax(split(queries).matmul(split(keys).transpose()) * scale, 3);
+    shares.matmul(split(values)).swap_dims(1, 2).reshape([batch, points, width])
+}
+
+/// What a rectifier with that slope for negative values makes of rows.
+fn rectified(x: Tensor<2>, slope: f32) -> Tensor<2> {
+    if slope == 1.0 { x } else { leaky_relu(x, f64::from(slope)) }
+}
+
+pub(super) fn dense(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, slope: f32) -> Tensor<2> {
+    rectified(x.matmul(weight.transpose()) + bias.unsqueeze(), slope)
+}
+
+pub(super) fn batch_norm(x: Tensor<2>, gamma: Tensor<1>, beta: Tensor<1>, slope: f32) -> Normalized {
+    let channels = x.dims()[1];
+    let mean = x.clone().mean_dim(0);
+    let variance = (x.clone() - mean.clone()).square().mean_dim(0);
+    let scale: Tensor<2> = (variance.clone() + EPSILON).sqrt().recip() * gamma.unsqueeze();
+    Normalized {
+        values: rectified((x - mean.clone()) * scale + beta.unsqueeze(), slope),
+        statistics: [mean, variance].map(|tensor| tensor.detach().reshape([channels])),
+    }
+}
+
+pub(super) fn layer_norm(x: Tensor<2>, scale: Tensor<1>, shift: Tensor<1>) -> Tensor<2> {
+    let channels = x.dims()[1] as f64;
+    let epsilon = f64::from(DEVIATION_EPSILON);
+    let centered = x.clone() - x.mean_dim(1);
+    let variance = centered.clone().square().sum_dim(1) / (channels - 1.0).max(1.0);
+    let deviation = (variance + epsilon * epsilon).sqrt() + epsilon;
+    centered / deviation * scale.unsqueeze() + shift.unsqueeze()
+}
+
+pub(super) fn group_max(x: Tensor<2>, size: usize) -> Tensor<2> {
+    let [rows, channels] = x.dims();
+    x.reshape([rows / size, size, channels]).max_dim(1).reshape([rows / size, channels])
 }

@@ -111,7 +111,7 @@ pub(super) fn signs(gamma: &[f32]) -> Vec<f32> {
 }
 
 #[multiversion(targets("x86_64+avx512f+avx512bw+avx512vl", "x86_64+avx2"))]
-fn normalize(values: &[f32], scale: &[f32], shift: &[f32], negative_slope: f32, out: &mut [f32]) {
+pub(super) fn normalize(values: &[f32], scale: &[f32], shift: &[f32], negative_slope: f32, out: &mut [f32]) {
     let channels = scale.len();
     for (out, values) in out.chunks_exact_mut(channels).zip(values.chunks_exact(channels)) {
         for (((out, value), scale), shift) in out.iter_mut().zip(values).zip(scale).zip(shift) {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use burn::tensor::activation::leaky_relu;
-use burn::tensor::{Device, Int, Tensor, TensorData};
+use burn::tensor::{Device, Gradients, Int, Tensor, TensorData};
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 use upcr::neighbors::KdTree;
@@ -12,7 +12,7 @@ use upcr::net::{Graph, Invariant, InvariantInputs};
 use super::canonical_chamfer::PairPoints;
 use super::edge_embed::EdgeInputs;
 use super::normalized::{Normalized, NormalizedMap};
-use super::{BatchGraph, extension, generic};
+use super::{BatchGraph, extension, generic, layers, nearest_features};
 use crate::random;
 
 const SLOPE: f32 = 0.2;
@@ -279,6 +279,143 @@ fn layers_give_the_same_bits_on_any_number_of_threads() {
             let map = random_map(32, 40, &mut rng);
             let out = extension::graph_layer(features.clone(), map.clone(), &graph, None).values;
             with_gradients(out, &map, Some(&features))
+        })
+    };
+    assert_eq!(run(1), run(3));
+}
+
+/// An input's gradient.
+type Slope<'a> = &'a dyn Fn(&Gradients) -> Vec<f32>;
+
+/// Values of an operation, and the gradients of a weighted sum of them with respect to its inputs.
+fn slopes<const D: usize>(out: Tensor<D>, gradients: &[Slope]) -> Vec<Vec<f32>> {
+    let shape = out.dims();
+    let weights = uniform(&mut random::stream(99, 0), shape.iter().product());
+    let found = (out.clone() * tensor(weights, shape)).sum().backward();
+    let mut all = vec![values(out)];
+    all.extend(gradients.iter().map(|gradient| gradient(&found)));
+    all
+}
+
+fn of<const D: usize>(input: &Tensor<D>) -> impl Fn(&Gradients) -> Vec<f32> {
+    let input = input.clone();
+    move |gradients| values(input.grad(gradients).unwrap())
+}
+
+#[track_caller]
+fn assert_all_close(what: &str, found: &[Vec<f32>], expected: &[Vec<f32>]) {
+    assert_eq!(found.len(), expected.len(), "{what}");
+    for (found, expected) in found.iter().zip(expected) {
+        assert_close(what, found, expected);
+    }
+}
+
+fn leaf<const D: usize>(shape: [usize; D], rng: &mut ChaCha8Rng) -> Tensor<D> {
+    tensor(uniform(rng, shape.iter().product()), shape).require_grad()
+}
+
+#[test]
+fn attention_is_its_tensor_form() {
+    let mut rng = random::stream(31, 0);
+    // One block and several, one head and several, a block of one row.
+    for (batch, points, others, channels, width, heads, scale) in
+        [(3, 20, 33, 12, 8, 4, 0.7), (2, 257, 130, 16, 16, 2, 3.0), (2, 40, 7, 5, 3, 1, 20.0)]
+    {
+        let queries = leaf([batch, points, channels], &mut rng);
+        let keys = leaf([batch, others, channels], &mut rng);
+        let sought = leaf([batch, others, width], &mut rng);
+        let gradients: [Slope; 3] = [&of(&queries), &of(&keys), &of(&sought)];
+        let inputs = || (queries.clone(), keys.clone(), sought.clone());
+        let (q, k, v) = inputs();
+        let found = slopes(layers::attention(q, k, v, heads, scale), &gradients);
+        let (q, k, v) = inputs();
+        let expected = slopes(generic::attention(q, k, v, heads, scale), &gradients);
+        assert_all_close("attention", &found, &expected);
+    }
+}
+
+#[test]
+fn maps_and_norms_of_rows_are_their_tensor_forms() {
+    let mut rng = random::stream(32, 0);
+    for (rows, inputs, outputs, slope) in [(2, 3, 5, 0.0), (300, 6, 16, 0.2), (2100, 16, 40, 1.0)] {
+        let x = leaf([rows, inputs], &mut rng);
+        let weight = leaf([outputs, inputs], &mut rng);
+        let [scale, shift] = [outputs, outputs].map(|length| leaf([length], &mut rng));
+        let gradients: [Slope; 3] = [&of(&x), &of(&weight), &of(&shift)];
+        let inputs = || (x.clone(), weight.clone(), shift.clone());
+        let (a, b, c) = inputs();
+        let found = slopes(layers::dense(a, b, c, slope), &gradients);
+        let (a, b, c) = inputs();
+        assert_all_close("dense", &found, &slopes(generic::dense(a, b, c, slope), &gradients));
+
+        // Far from zero, where squares alone would tell little of the variance.
+        let x = tensor(uniform(&mut rng, rows * outputs).iter().map(|v| v + 30.0).collect(), [rows, outputs]);
+        let x = x.require_grad();
+        let gradients: [Slope; 3] = [&of(&x), &of(&scale), &of(&shift)];
+        let inputs = || (x.clone(), scale.clone(), shift.clone());
+        if rows > 2 {
+            let (a, b, c) = inputs();
+            let norm = layers::batch_norm(a, b, c, slope);
+            let (a, b, c) = inputs();
+            let expected = generic::batch_norm(a, b, c, slope);
+            for (found, expected) in norm.statistics.into_iter().zip(expected.statistics) {
+                assert_close("statistics", &values(found), &values(expected));
+            }
+            let found = slopes(norm.values, &gradients);
+            assert_all_close("batch norm", &found, &slopes(expected.values, &gradients));
+        }
+        let (a, b, c) = inputs();
+        let found = slopes(layers::layer_norm(a, b, c), &gradients);
+        let (a, b, c) = inputs();
+        assert_all_close("layer norm", &found, &slopes(generic::layer_norm(a, b, c), &gradients));
+    }
+}
+
+#[test]
+fn groups_have_their_largest_values() {
+    let mut rng = random::stream(33, 0);
+    for (groups, size, channels) in [(7, 1, 4), (90, 8, 17), (3, 500, 32)] {
+        let x = leaf([groups * size, channels], &mut rng);
+        let found = slopes(layers::group_max(x.clone(), size), &[&of(&x)]);
+        assert_eq!(found, slopes(generic::group_max(x.clone(), size), &[&of(&x)]));
+    }
+}
+
+#[test]
+fn neighbours_by_features_are_the_nearest() {
+    let mut rng = random::stream(34, 0);
+    let (count, channels, k) = (60, 5, 7);
+    let features = uniform(&mut rng, 3 * count * channels);
+    let graph = nearest_features(&features, count, channels, k);
+    for (cloud, features) in features.chunks_exact(count * channels).enumerate() {
+        for (i, point) in features.chunks_exact(channels).enumerate() {
+            let distance =
+                |other: &[f32]| -> f32 { point.iter().zip(other).map(|(a, b)| (a - b).powi(2)).sum() };
+            let distances: Vec<f32> = features.chunks_exact(channels).map(distance).collect();
+            let mut order: Vec<u32> = (0..count as u32).collect();
+            order.sort_by(|&a, &b| distances[a as usize].total_cmp(&distances[b as usize]));
+            assert_eq!(graph.view(cloud).row(i), &order[..k]);
+        }
+    }
+    // Of equal points the first come first.
+    let graph = nearest_features(&[1.0; 12], 4, 3, 2);
+    assert_eq!(graph.neighbors, [0, 1, 0, 1, 0, 1, 0, 1]);
+    assert_eq!(nearest_features(&[1.0, 2.0], 2, 1, 9).k, 2);
+}
+
+#[test]
+fn rows_give_the_same_bits_on_any_number_of_threads() {
+    let run = |threads: usize| {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {
+            let mut rng = random::stream(35, 0);
+            let x = leaf([8 * 300, 16], &mut rng);
+            let weight = leaf([24, 16], &mut rng);
+            let [scale, shift] = [24, 24].map(|length| leaf([length], &mut rng));
+            let y = layers::dense(x.clone(), weight.clone(), shift.clone(), 0.2);
+            let y = layers::batch_norm(y, scale.clone(), shift.clone(), 0.0).values;
+            let y = layers::layer_norm(y, scale.clone(), shift.clone()).reshape([8, 300, 24]);
+            let y = layers::attention(y.clone(), y.clone(), y, 2, 0.3);
+            slopes(y, &[&of(&x), &of(&weight), &of(&scale), &of(&shift)])
         })
     };
     assert_eq!(run(1), run(3));
