@@ -10,7 +10,7 @@ use super::buffer::Buffer;
 use super::product::{Matrix, product, product_with_stride};
 
 /// Queries that are worked on together.
-const BLOCK: usize = 128;
+const BLOCK: usize = 256;
 /// Sums over a row are formed in so many parts, whatever the instruction set.
 const LANES: usize = 16;
 

@@ -10,7 +10,7 @@ use super::graph_layer::{EPSILON, normalize};
 use super::product::{Matrix, product};
 
 /// Rows that are worked on together.
-const BLOCK: usize = 128;
+const BLOCK: usize = 256;
 /// Sums of matrices over rows are formed in so many parts.
 const PARTS: usize = 16;
 /// What a layer norm adds to a standard deviation.

@@ -319,7 +319,7 @@ fn attention_is_its_tensor_form() {
     let mut rng = random::stream(31, 0);
     // One block and several, one head and several, a block of one row.
     for (batch, points, others, channels, width, heads, scale) in
-        [(3, 20, 33, 12, 8, 4, 0.7), (2, 257, 130, 16, 16, 2, 3.0), (2, 40, 7, 5, 3, 1, 20.0)]
+        [(3, 20, 33, 12, 8, 4, 0.7), (2, 513, 130, 16, 16, 2, 3.0), (2, 40, 7, 5, 3, 1, 20.0)]
     {
         let queries = leaf([batch, points, channels], &mut rng);
         let keys = leaf([batch, others, channels], &mut rng);
