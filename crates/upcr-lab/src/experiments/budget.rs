@@ -47,6 +47,9 @@ pub struct Learning {
     pub length: Length,
     /// Adam's step size at its largest.
     pub learning_rate: f64,
+    /// Pairs of a batch, in place of the budget's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub batch: Option<usize>,
 }
 
 impl Budget {
@@ -109,7 +112,8 @@ impl Budget {
         points: usize,
         seed: u64,
     ) -> TrainingConfig {
-        let stage = Stage { points, k: None, batch: self.batch, length: learning.length };
+        let batch = learning.batch.unwrap_or(self.batch);
+        let stage = Stage { points, k: None, batch, length: learning.length };
         TrainingConfig {
             seed,
             stages: vec![stage],
