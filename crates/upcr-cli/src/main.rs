@@ -27,6 +27,9 @@ static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
 /// `register` ran, but found no pose to trust.
 const NOT_REGISTERED: u8 = 3;
+/// Stopped before the end, as shells have it after Ctrl-C.
+#[cfg(feature = "train")]
+const STOPPED: u8 = 130;
 
 fn after_help() -> String {
     format!(
@@ -36,6 +39,7 @@ Exit status:
   1  error: a file, a cloud or a setting is not usable; the reason is on stderr
   2  the command line is not understood
   3  `register` found no trustworthy pose (probability below {})
+  130  `train` or `reproduce` was stopped and can go on
 
 The answer alone goes to stdout; errors and progress go to stderr.",
         upcr::TRUSTWORTHY

@@ -10,6 +10,7 @@ use upcr_lab::experiments::{
 };
 use upcr_lab::files::write_atomically;
 
+use crate::STOPPED;
 use crate::output;
 use crate::train::{Backend, Teller, duration};
 
@@ -75,7 +76,7 @@ fn reproduce(args: &Args) -> Result<ExitCode> {
     };
     let Some(results) = reproduction.run(&chosen, &mut Teller::new()?)? else {
         output::note("stopped; the same command goes on");
-        return Ok(ExitCode::FAILURE);
+        return Ok(ExitCode::from(STOPPED));
     };
     for outcome in &results.experiments {
         if outcome.data.is_none() {

@@ -14,6 +14,7 @@ use upcr_lab::files::write_atomically;
 use upcr_lab::models::LearnedConfig;
 use upcr_lab::train::{Event, Trainer, TrainingConfig, Watcher, write_history};
 
+use crate::STOPPED;
 use crate::output;
 use crate::pairs::Pairs;
 
@@ -137,7 +138,7 @@ fn train(args: &Args) -> Result<ExitCode> {
     write_history(&folder, trainer.history())?;
     if !done {
         output::note(&format!("stopped; go on with: upcr train --resume {}", folder.display()));
-        return Ok(ExitCode::SUCCESS);
+        return Ok(ExitCode::from(STOPPED));
     }
     let weights = folder.join("weights.safetensors");
     write_atomically(&weights, &trainer.weights().to_bytes()?)?;

@@ -346,6 +346,30 @@ fn experiments_are_reproduced_and_go_on_after_a_kill() {
 }
 
 #[test]
+#[cfg(unix)]
+fn a_reproduction_stops_when_it_is_told_to() {
+    let scratch = Scratch::new();
+    shapes(&scratch);
+    let experiment = scratch.file("boxes.toml", EXPERIMENT);
+    let budget = scratch.file("long.toml", &BUDGET.replace("steps = 30", "steps = 1000000"));
+    let out = scratch.path("out");
+    let arguments =
+        ["reproduce", &experiment, "--budget", &budget, "--data", &scratch.path(""), "--out", &out];
+    let mut child = command().args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    while !Path::new(&out).join("weights").exists() {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    std::thread::sleep(Duration::from_millis(300));
+    let interrupted = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status();
+    assert!(interrupted.unwrap().success());
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    // What it goes on from.
+    let folders = std::fs::read_dir(Path::new(&out).join("weights")).unwrap();
+    let folder = folders.map(|entry| entry.unwrap().path()).next().unwrap();
+    assert!(folder.join("checkpoint.safetensors").exists());
+}
+
+#[test]
 fn what_cannot_be_reproduced_is_told() {
     let scratch = Scratch::new();
     let (data, out) = (scratch.path(""), scratch.path("out"));

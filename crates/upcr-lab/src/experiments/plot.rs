@@ -102,7 +102,8 @@ impl<'a> Drawing<'a> {
             .label_style(font)
             .x_desc(heading(&self.plot.measure))
             .x_label_formatter(&|v| format!("{v}"))
-            .light_line_style(WHITE)
+            .bold_line_style(BLACK.mix(0.15))
+            .light_line_style(BLACK.mix(0.06))
             .y_labels(0)
             .draw()?;
         let row = |method: usize| (count - 1 - method) as f64;
@@ -113,7 +114,7 @@ impl<'a> Drawing<'a> {
             area.draw(&Text::new((*name).to_owned(), (x - 8 * unit as i32, y), style.clone()))?;
             chart.draw_series([PathElement::new(
                 [(low * 0.7, row(index)), (high * 1.4, row(index))],
-                BLACK.mix(0.12).stroke_width(unit),
+                BLACK.mix(0.08).stroke_width(unit),
             )])?;
         }
         let sets = self.settings.len() as f64;
@@ -145,6 +146,7 @@ impl<'a> Drawing<'a> {
             .configure_series_labels()
             .position(SeriesLabelPosition::UpperRight)
             .label_font(font)
+            .legend_area_size(22 * unit)
             .background_style(WHITE.mix(0.85))
             .border_style(BLACK.mix(0.3))
             .draw()?;
@@ -187,6 +189,7 @@ impl<'a> Drawing<'a> {
             .configure_series_labels()
             .position(SeriesLabelPosition::UpperLeft)
             .label_font(font)
+            .legend_area_size(22 * unit)
             .background_style(WHITE.mix(0.85))
             .border_style(BLACK.mix(0.3))
             .draw()?;

@@ -153,10 +153,9 @@ impl Reproduction {
                     let Some(lessons) = store.learn(weights, &mut told)? else { return Ok(None) };
                     learned.extend(lessons.into_iter().map(|lesson| (lesson.weights.clone(), lesson)));
                 }
-                if spectator.stop() {
+                if told.spectator.stop() {
                     return Ok(None);
                 }
-                let mut told = Told { tasks: &mut tasks, spectator: &mut *spectator, experiment: name };
                 let values = store.test(&test, &format!("{method}, {setting}"), &mut told)?;
                 cells.push(Measured { setting, method, seed, weights: test.weights.map(|w| w.id()), values });
             }
