@@ -9,7 +9,7 @@ use plotters_backend::{BackendCoord, DrawingErrorKind};
 use super::description::{Plot, PlotKind};
 use super::report::{Spread, heading};
 use super::reproduce::Outcome;
-use crate::drawing::{COLORS, Drawn, Picture};
+use crate::drawing::{CAPTION, COLORS, Drawn, LETTERS, Picture, font, legend};
 
 /// The experiment's picture; `None` where it has none, or nothing was measured.
 pub fn picture(outcome: &Outcome) -> Option<impl Picture + '_> {
@@ -88,9 +88,9 @@ impl<'a> Drawing<'a> {
         // Errors below a hundredth of the measure's unit are drawn at it.
         let (low, high) = self.range();
         let low = low.max(high * 1e-4).max(1e-2);
-        let font = ("sans-serif", 13 * unit);
+        let letters = font(LETTERS, unit);
         let mut chart = ChartBuilder::on(area)
-            .caption(&self.outcome.experiment.title, ("sans-serif", 18 * unit))
+            .caption(&self.outcome.experiment.title, font(CAPTION, unit))
             .margin(12 * unit)
             .x_label_area_size(40 * unit)
             .y_label_area_size(230 * unit)
@@ -99,7 +99,7 @@ impl<'a> Drawing<'a> {
             .configure_mesh()
             .disable_y_mesh()
             .disable_y_axis()
-            .label_style(font)
+            .label_style(letters)
             .x_desc(heading(&self.plot.measure))
             .x_label_formatter(&|v| format!("{v}"))
             .bold_line_style(BLACK.mix(0.15))
@@ -108,7 +108,7 @@ impl<'a> Drawing<'a> {
             .draw()?;
         let row = |method: usize| (count - 1 - method) as f64;
         // Names stand left of the axis, where the mesh has none.
-        let style = TextStyle::from(font.into_font()).pos(Pos::new(HPos::Right, VPos::Center));
+        let style = TextStyle::from(letters.into_font()).pos(Pos::new(HPos::Right, VPos::Center));
         for (index, name) in self.methods.iter().enumerate() {
             let (x, y) = chart.backend_coord(&(low * 0.7, row(index)));
             area.draw(&Text::new((*name).to_owned(), (x - 8 * unit as i32, y), style.clone()))?;
@@ -142,15 +142,7 @@ impl<'a> Drawing<'a> {
                 }
             }
         }
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::UpperRight)
-            .label_font(font)
-            .legend_area_size(22 * unit)
-            .background_style(WHITE.mix(0.85))
-            .border_style(BLACK.mix(0.3))
-            .draw()?;
-        Ok(())
+        legend(&mut chart, SeriesLabelPosition::UpperRight, unit)
     }
 
     fn lines<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
@@ -159,9 +151,9 @@ impl<'a> Drawing<'a> {
     {
         let (_, high) = self.range();
         let last = self.settings.iter().map(|(_, x)| *x).fold(0.0, f64::max);
-        let font = ("sans-serif", 13 * unit);
+        let letters = font(LETTERS, unit);
         let mut chart = ChartBuilder::on(area)
-            .caption(&self.outcome.experiment.title, ("sans-serif", 18 * unit))
+            .caption(&self.outcome.experiment.title, font(CAPTION, unit))
             .margin(12 * unit)
             .x_label_area_size(40 * unit)
             .y_label_area_size(56 * unit)
@@ -169,7 +161,7 @@ impl<'a> Drawing<'a> {
         chart
             .configure_mesh()
             .light_line_style(WHITE)
-            .label_style(font)
+            .label_style(letters)
             .x_desc("outliers, % of each cloud's points")
             .y_desc(heading(&self.plot.measure))
             .draw()?;
@@ -185,15 +177,7 @@ impl<'a> Drawing<'a> {
                 .label(*name)
                 .legend(move |(x, y)| mark_at((x + 8 * unit as i32, y), index, color, false, unit));
         }
-        chart
-            .configure_series_labels()
-            .position(SeriesLabelPosition::UpperLeft)
-            .label_font(font)
-            .legend_area_size(22 * unit)
-            .background_style(WHITE.mix(0.85))
-            .border_style(BLACK.mix(0.3))
-            .draw()?;
-        Ok(())
+        legend(&mut chart, SeriesLabelPosition::UpperLeft, unit)
     }
 }
 

@@ -115,10 +115,8 @@ impl Dcp {
         statistics: Statistics,
         found: &mut BatchStatistics,
     ) -> ([Tensor<3>; 2], [Tensor<3>; 2]) {
-        let [pairs, ..] = source_points.dims();
-        let clouds = Tensor::cat(vec![source_points.clone(), target_points.clone()], 0);
-        let features = self.emb_nn.forward(&clouds, self.config.k, statistics, found);
-        let (source, target) = (features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs));
+        let k = self.config.k;
+        let [source, target] = self.emb_nn.of_pairs(source_points, target_points, k, statistics, found);
         let attended = match &self.pointer {
             Some(pointer) => pointer.forward(&source, &target),
             None => [source.clone(), target.clone()],

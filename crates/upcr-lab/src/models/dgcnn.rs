@@ -101,6 +101,21 @@ impl Dgcnn {
         joined.reshape([clouds, count, channels])
     }
 
+    /// The same of sources and of targets, which are normalised together.
+    pub fn of_pairs(
+        &self,
+        source: &Tensor<3>,
+        target: &Tensor<3>,
+        k: usize,
+        statistics: Statistics,
+        found: &mut BatchStatistics,
+    ) -> [Tensor<3>; 2] {
+        let [pairs, ..] = source.dims();
+        let clouds = Tensor::cat(vec![source.clone(), target.clone()], 0);
+        let features = self.forward(&clouds, k, statistics, found);
+        [features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs)]
+    }
+
     fn layers(&self) -> [(&Dense, &BatchNorm); 4] {
         [
             (&self.conv1, &self.bn1),

@@ -155,10 +155,8 @@ impl Prnet {
         statistics: Statistics,
         found: &mut BatchStatistics,
     ) -> [Tensor<3>; 2] {
-        let [pairs, ..] = source_points.dims();
-        let clouds = Tensor::cat(vec![source_points.clone(), target_points.clone()], 0);
-        let features = self.emb_nn.forward(&clouds, self.config.k, statistics, found);
-        let (source, target) = (features.clone().narrow(0, 0, pairs), features.narrow(0, pairs, pairs));
+        let k = self.config.k;
+        let [source, target] = self.emb_nn.of_pairs(source_points, target_points, k, statistics, found);
         let [source_gain, target_gain] = self.attention.forward(&source, &target);
         [source + source_gain, target + target_gain]
     }

@@ -8,7 +8,7 @@ use plotters::prelude::*;
 use upcr::Result;
 
 use super::history::Event;
-use crate::drawing::{self, COLORS, Drawn, Picture};
+use crate::drawing::{self, CAPTION, COLORS, Drawn, LETTERS, Picture, font, legend};
 use crate::files::write_atomically;
 
 const SIZE: (u32, u32) = (960, 420);
@@ -76,13 +76,18 @@ where
         return Ok(());
     }
     let mut chart = ChartBuilder::on(area)
-        .caption(title, ("sans-serif", 18 * unit))
+        .caption(title, font(CAPTION, unit))
         .margin(12 * unit)
         .x_label_area_size(36 * unit)
         .y_label_area_size(64 * unit)
         .build_cartesian_2d(0.0..last, (low * 0.8..high * 1.25).log_scale())?;
-    let label = ("sans-serif", 12 * unit);
-    chart.configure_mesh().light_line_style(WHITE).label_style(label).x_desc("steps").x_labels(6).draw()?;
+    chart
+        .configure_mesh()
+        .light_line_style(WHITE)
+        .label_style(font(LETTERS, unit))
+        .x_desc("steps")
+        .x_labels(6)
+        .draw()?;
     for (name, color, points) in lines {
         let color = *color;
         chart
@@ -92,13 +97,7 @@ where
                 PathElement::new([(x, y), (x + 18 * unit as i32, y)], color.stroke_width(2 * unit))
             });
     }
-    chart
-        .configure_series_labels()
-        .label_font(label)
-        .background_style(WHITE.mix(0.8))
-        .border_style(BLACK.mix(0.3))
-        .draw()?;
-    Ok(())
+    legend(&mut chart, SeriesLabelPosition::MiddleRight, unit)
 }
 
 /// Writes the curve into a run's folder: `history.csv`, and `history.svg` as a picture.
