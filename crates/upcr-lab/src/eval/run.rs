@@ -181,13 +181,13 @@ pub fn markdown(rows: &[Row]) -> String {
 pub fn csv(rows: &[Row]) -> String {
     let mut text = String::from(
         "method,protocol,overlap,noise,pairs,rmse_r_deg,mae_r_deg,rmse_t,mae_t,rre_mean_deg,rte_mean,me_bregier,\
-         recall,ms_per_pair,ms_median\n",
+         recall,found,ms_per_pair,ms_median\n",
     );
     for r in rows {
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             r.method,
             r.protocol,
             r.overlap,
@@ -201,6 +201,7 @@ pub fn csv(rows: &[Row]) -> String {
             r.rte_mean,
             r.me_bregier,
             r.recall,
+            r.found,
             r.ms_per_pair,
             r.ms_median
         );
@@ -249,7 +250,7 @@ mod tests {
         assert!(table.contains("| default | 3 |"), "{table}");
         let csv = csv(&[row]);
         let widths: Vec<usize> = csv.lines().map(|line| line.split(',').count()).collect();
-        assert_eq!(widths, [15, 15]);
+        assert_eq!(widths, [16, 16]);
     }
 
     #[test]

@@ -387,10 +387,20 @@ fn named(weights: &Weights) -> String {
 }
 
 /// What tasks of one kind have in common: they take so long for each unit of work.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 struct Pace {
     kind: String,
+    learns: bool,
     work: u64,
+}
+
+/// What tasks of a kind have taken.
+#[derive(Debug, Clone, Copy, Default)]
+struct Spent {
+    seconds: f64,
+    work: u64,
+    tasks: u64,
+    learning: bool,
 }
 
 impl Pace {
@@ -406,13 +416,13 @@ impl Pace {
             LearnedConfig::Upcr(config) => format!("{:?}", config.invariant),
             _ => String::new(),
         };
-        Self { kind: format!("{} {invariant} learns", weights.network), work }
+        Self { kind: format!("{} {invariant} learns", weights.network), learns: true, work }
     }
 
     fn of_test(test: &Test) -> Self {
         let network = test.weights.as_ref().map_or("", |weights| &weights.network);
         let frames = if test.setting.frames_apart.is_some() { "frames" } else { "shapes" };
-        Self { kind: format!("{:?} {network} {frames} test", test.run), work: 1 }
+        Self { kind: format!("{:?} {network} {frames} test", test.run), learns: false, work: 1 }
     }
 }
 
@@ -422,8 +432,8 @@ struct Tasks {
     /// By name, as [`Weights::id`] and [`Test::id`] give it.
     open: BTreeMap<String, Pace>,
     of: usize,
-    /// Time and work by kind.
-    spent: BTreeMap<String, (Duration, u64)>,
+    /// By kind.
+    spent: BTreeMap<String, Spent>,
 }
 
 impl Tasks {
@@ -440,15 +450,20 @@ impl Tasks {
         Self { of: open.len(), open, spent: BTreeMap::new() }
     }
 
-    /// Time to the end: of kinds of which one has been done, at their pace; of others at the mean of a task.
+    /// Time to the end: of kinds of which one has been done, at their pace; of others as much as learning, or a test,
+    /// takes on the average. `None` before there is any.
     fn time_left(&self) -> Option<Duration> {
-        let count = self.spent.len() as f64;
-        let mean = self.spent.values().map(|(time, _)| time.as_secs_f64()).sum::<f64>() / count;
+        let mean = |learns: bool| {
+            let of_sort = || self.spent.values().filter(|spent| spent.learning == learns);
+            let tasks = of_sort().map(|spent| spent.tasks).sum::<u64>();
+            (tasks > 0).then(|| of_sort().map(|spent| spent.seconds).sum::<f64>() / tasks as f64)
+        };
+        let means = [mean(false), mean(true)];
         let seconds = self.open.values().map(|pace| match self.spent.get(&pace.kind) {
-            Some((time, work)) => time.as_secs_f64() * pace.work as f64 / (*work).max(1) as f64,
-            None => mean,
+            Some(spent) => Some(spent.seconds * pace.work as f64 / spent.work.max(1) as f64),
+            None => means[usize::from(pace.learns)],
         });
-        Duration::try_from_secs_f64(seconds.sum()).ok()
+        Duration::try_from_secs_f64(seconds.sum::<Option<f64>>()?).ok()
     }
 }
 
@@ -479,8 +494,10 @@ impl Told<'_> {
     fn ends(&mut self, id: &str, work: u64, time: Duration) {
         if let Some(pace) = self.tasks.open.remove(id) {
             let spent = self.tasks.spent.entry(pace.kind).or_default();
-            spent.0 += time;
-            spent.1 += work;
+            spent.learning = pace.learns;
+            spent.seconds += time.as_secs_f64();
+            spent.work += work;
+            spent.tasks += 1;
         }
     }
 }
@@ -504,5 +521,33 @@ fn read_json<T: DeserializeOwned>(path: &Path) -> Result<Option<T>> {
         }),
         Err(source) if source.kind() == std::io::ErrorKind::NotFound => Ok(None),
         Err(source) => Err(Error::Io { path: path.into(), source }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_left_is_reckoned_from_what_has_been_done() {
+        let pace = |kind: &str, learns: bool, work: u64| Pace { kind: kind.into(), learns, work };
+        let open = [
+            ("long", pace("upcr", true, 400)),
+            ("other", pace("dcp", true, 30)),
+            ("test", pace("icp", false, 1)),
+        ];
+        let mut tasks = Tasks {
+            open: open.map(|(id, pace)| (id.to_owned(), pace)).into(),
+            of: 5,
+            spent: BTreeMap::new(),
+        };
+        assert_eq!(tasks.time_left(), None);
+        let done = |learning: bool, work: u64| Spent { seconds: 10.0, work, tasks: 1, learning };
+        tasks.spent.insert("upcr".into(), done(true, 100));
+        // Nothing is known of tests yet.
+        assert_eq!(tasks.time_left(), None);
+        tasks.spent.insert("fgr".into(), done(false, 1));
+        // The long one takes four times what its kind took, the others what theirs take on the average.
+        assert_eq!(tasks.time_left(), Some(Duration::from_secs(40 + 10 + 10)));
     }
 }
