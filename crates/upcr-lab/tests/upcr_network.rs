@@ -6,10 +6,12 @@ use std::path::Path;
 
 use burn::module::Param;
 use burn::tensor::{Device, Tensor};
-use upcr::net::{Graph, NetworkConfig};
+use rand::Rng;
+use upcr::net::{Graph, Invariant, Network, NetworkConfig};
 use upcr_lab::models::tensor_file::TensorFile;
 use upcr_lab::models::weights::restore;
-use upcr_lab::models::{CloudInput, Clouds, NormalizedLayer, Statistics};
+use upcr_lab::models::{CloudInput, Clouds, LearnedConfig, NormalizedLayer, Statistics};
+use upcr_lab::random;
 
 fn golden(name: &str) -> TensorFile {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../upcr/tests/golden").join(name);
@@ -128,5 +130,37 @@ fn learning_gives_the_golden_loss_and_gradients() {
             check(&format!("head.{l}.weight"), gradient2(&linear.weight));
             check(&format!("head.{l}.bias"), gradient1(&linear.bias));
         }
+    }
+}
+
+#[test]
+fn use_sees_flat_surfaces_as_learning_did() {
+    // Faces of a box, away from the origin: there nothing but rounding chooses the sides of normals.
+    let mut rng = random::stream(21, 0);
+    let mut cloud = || -> Vec<[f32; 3]> {
+        (0..200)
+            .map(|i| {
+                let mut p = [0.3, 0.2, 0.5].map(|side| rng.random_range(-side..side));
+                p[i % 3] = [0.3, 0.2, 0.5][i % 3] * if i % 2 == 0 { 1.0 } else { -1.0 };
+                [p[0] + 0.37, p[1] - 1.21, p[2] + 0.77]
+            })
+            .collect()
+    };
+    for invariant in [Invariant::Spfh, Invariant::Pfh, Invariant::DistancePpfSpfh] {
+        let config = NetworkConfig {
+            k: 8,
+            widths: vec![16, 32],
+            head: vec![16],
+            invariant,
+            ..NetworkConfig::default()
+        };
+        let network = LearnedConfig::Upcr(config).init(3, &Device::flex()).unwrap();
+        let in_use = Network::from_safetensors(&network.store().to_bytes().unwrap()).unwrap();
+        let (source, target) = (cloud(), cloud());
+        let expected = network.predict(source.clone(), target.clone()).unwrap();
+        let found = in_use.predict(&source, &target).unwrap();
+        let off = (found.rotation - expected.rotation).amax();
+        let moved = (found.translation - expected.translation).amax();
+        assert!(off < 1e-5 && moved < 1e-5, "{invariant:?}: {off} {moved}");
     }
 }

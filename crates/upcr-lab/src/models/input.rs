@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use upcr::Result;
 use upcr::neighbors::KdTree;
-use upcr::net::{Graph, InvariantInputs, NetworkConfig};
+use upcr::net::{Graph, InvariantInputs, NetworkConfig, centered};
 
 use crate::ops::BatchGraph;
 use crate::ops::canonical_chamfer::PairPoints;
@@ -28,14 +28,9 @@ impl CloudInput {
     ///
     /// # Errors
     /// Where the invariant feature cannot be computed.
-    pub fn new(points: &[[f32; 3]], config: &NetworkConfig) -> Result<Self> {
-        let mut sum = [0.0_f64; 3];
-        for p in points {
-            sum.iter_mut().zip(p).for_each(|(s, &v)| *s += f64::from(v));
-        }
-        let centroid = sum.map(|s| (s / points.len() as f64) as f32);
-        let points: Vec<[f32; 3]> =
-            points.iter().map(|p| [p[0] - centroid[0], p[1] - centroid[1], p[2] - centroid[2]]).collect();
+    pub fn new(cloud: &[[f32; 3]], config: &NetworkConfig) -> Result<Self> {
+        let mut points = Vec::new();
+        let centroid = centered(cloud, &mut points);
         let neighborhoods = KdTree::new(&points).knn_graph(config.k);
         let phi = config.invariant.inputs(&points, &neighborhoods)?;
         Ok(Self { points, centroid, graph: Graph::from(&neighborhoods), phi })

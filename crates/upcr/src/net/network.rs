@@ -227,10 +227,7 @@ impl Network {
     fn prepare(&self, cloud: &[[f32; 3]], k: usize, room: &mut Room) -> Result<()> {
         let Room { representations, points, order, neighbors, inputs, search, .. } = room;
         let Neighbors { graph, rows } = neighbors;
-        let o = centroid(cloud);
-        representations.centroid = o;
-        points.clear();
-        points.extend(cloud.iter().map(|p| [0, 1, 2].map(|a| (f64::from(p[a]) - o[a]) as f32)));
+        representations.centroid = centered(cloud, points).map(f64::from);
         match self.config.invariant {
             Invariant::None => nearest(points, k, order, graph, search),
             Invariant::Distance => {
@@ -326,9 +323,14 @@ fn check(cloud: &[[f32; 3]], role: CloudRole) -> Result<()> {
     }
 }
 
-fn centroid(cloud: &[[f32; 3]]) -> [f64; 3] {
+/// Fills `points` with the cloud about its centroid, which is returned. Learning and use centre clouds alike to the last
+/// bit: where a surface is flat, the sign of a normal turns on it, and with the normal the histograms.
+pub fn centered(cloud: &[[f32; 3]], points: &mut Vec<[f32; 3]>) -> [f32; 3] {
     let sum = cloud.iter().fold([0.0; 3], |sum, p| [0, 1, 2].map(|a| sum[a] + f64::from(p[a])));
-    sum.map(|s| s / cloud.len() as f64)
+    let centroid = sum.map(|s| (s / cloud.len() as f64) as f32);
+    points.clear();
+    points.extend(cloud.iter().map(|p| [0, 1, 2].map(|a| p[a] - centroid[a])));
+    centroid
 }
 
 /// φ of [`Invariant::Distance`] for points about their centroid, over rows in any order.
