@@ -1,5 +1,6 @@
 //! `upcr reproduce`: the paper's experiments.
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -19,7 +20,7 @@ Experiments: consistent, partial, seven_scenes, rotation, outliers, invariants, 
 your own in their form is taken as well.
 
 Files in the output folder:
-  report.md                tables and pictures of all experiments
+  report.md                tables and pictures of the experiments named
   results.json             the same with all digits, settings and the paper's figures
   NAME.csv, .svg, .png     an experiment's measurements and its picture
   weights/, tests/         what has learned and what was measured: never done twice, a stopped run goes on from there";
@@ -34,7 +35,7 @@ pub struct Args {
     /// How much it may cost: `quick`, two hours on two cores, `full`, the paper's own, or a file in their form
     #[arg(long, value_name = "NAME", default_value = "quick")]
     budget: String,
-    /// Folder of the data sets: modelnet40_ply_hdf5_2048 or shapes69; 7scenes or redkitchen [default: $UPCR_DATA, else data]
+    /// Folder of the data sets: modelnet40_ply_hdf5_2048 or shapes69; 7scenes/redkitchen or redkitchen [default: $UPCR_DATA, else data]
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
     /// Threads to use [default: all]; only times depend on it
@@ -53,13 +54,21 @@ pub fn run(args: &Args) -> Result<ExitCode> {
 }
 
 fn reproduce(args: &Args) -> Result<ExitCode> {
-    let chosen: Vec<(String, Experiment)> = if args.names.iter().any(|name| name == "all") {
-        experiments::names()
-            .map(|name| Ok((name.to_owned(), experiments::by_name(name)?)))
-            .collect::<Result<_>>()?
-    } else {
-        args.names.iter().map(|name| chosen(name)).collect::<Result<_>>()?
-    };
+    let mut chosen = Vec::new();
+    for name in &args.names {
+        match name.as_str() {
+            "all" => {
+                for name in experiments::names() {
+                    chosen.push((name.to_owned(), experiments::by_name(name)?));
+                }
+            }
+            name => chosen.push(experiment(name)?),
+        }
+    }
+    let mut seen = BTreeSet::new();
+    if let Some((name, _)) = chosen.iter().find(|(name, _)| !seen.insert(name)) {
+        bail!("{name} is named twice: its files would take each other's place");
+    }
     let data = args.data.clone().unwrap_or_else(|| {
         std::env::var_os("UPCR_DATA").filter(|v| !v.is_empty()).map_or_else(|| "data".into(), PathBuf::from)
     });
@@ -74,10 +83,11 @@ fn reproduce(args: &Args) -> Result<ExitCode> {
         budget_name: args.budget.clone(),
         device: args.backend.device(),
     };
-    let Some(results) = reproduction.run(&chosen, &mut Teller::new()?)? else {
-        output::note("stopped; the same command goes on");
-        return Ok(ExitCode::from(STOPPED));
-    };
+    let results = reproduction.run(&chosen, &mut Teller::new()?)?;
+    let command = format!("upcr reproduce {} --budget {}", args.names.join(" "), args.budget);
+    let path = args.out.join("report.md");
+    write_atomically(&args.out.join("results.json"), serde_json::to_string_pretty(&results)?.as_bytes())?;
+    write_atomically(&path, markdown(&results, &command).as_bytes())?;
     for outcome in &results.experiments {
         if outcome.data.is_none() {
             let names = outcome.experiment.data.join(", ");
@@ -85,16 +95,16 @@ fn reproduce(args: &Args) -> Result<ExitCode> {
         }
         write_outcome(&args.out, outcome)?;
     }
-    let command = format!("upcr reproduce {} --budget {}", args.names.join(" "), args.budget);
-    let path = args.out.join("report.md");
-    write_atomically(&args.out.join("results.json"), serde_json::to_string_pretty(&results)?.as_bytes())?;
-    write_atomically(&path, markdown(&results, &command).as_bytes())?;
+    if !results.finished {
+        output::note("stopped; the same command goes on");
+        return Ok(ExitCode::from(STOPPED));
+    }
     output::answer(&format!("{}\n", path.display()))?;
     Ok(ExitCode::SUCCESS)
 }
 
 /// An experiment of the program's, or of a file.
-fn chosen(name: &str) -> Result<(String, Experiment)> {
+fn experiment(name: &str) -> Result<(String, Experiment)> {
     let Some(text) = file(name)? else { return Ok((name.to_owned(), experiments::by_name(name)?)) };
     let experiment = Experiment::from_toml(&text).with_context(|| name.to_owned())?;
     let stem = Path::new(name).file_stem().unwrap_or_default().to_string_lossy().into_owned();

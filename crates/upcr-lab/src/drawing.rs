@@ -123,7 +123,7 @@ fn failed(error: &dyn StdError) -> Error {
     Error::InvalidSetting { name: "plot", reason: error.to_string() }
 }
 
-/// Letters come with the program: what it draws is the same on every machine.
+/// Letters come with the program: bitmaps are the same on every machine.
 fn prepare_fonts() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {

@@ -84,6 +84,12 @@ pub enum Error {
         /// In which way.
         reason: &'static str,
     },
+    /// The loss of a network that learns is no longer finite.
+    #[error("the loss is no longer finite at step {step}; a smaller step size may help")]
+    Diverged {
+        /// Steps done before.
+        step: u64,
+    },
     /// A network's weights are not what its configuration demands.
     #[error("network weights: {reason}")]
     InvalidWeights {

@@ -69,9 +69,32 @@ impl Budget {
     /// Reads the file form of one budget.
     ///
     /// # Errors
-    /// Where the text is none.
+    /// Where the text is none, or one that nothing can be done with.
     pub fn from_toml(text: &str) -> Result<Self> {
-        toml::from_str(text).map_err(|e| refused(e.to_string()))
+        let budget: Self = toml::from_str(text).map_err(|e| refused(e.to_string()))?;
+        budget.check()?;
+        Ok(budget)
+    }
+
+    /// Refuses what nothing can be done with.
+    ///
+    /// # Errors
+    /// Where a number is out of its range.
+    pub fn check(&self) -> Result<()> {
+        // So that three quarters of the points are a whole number of them, in learning as in tests.
+        if self.points == 0 || !self.points.is_multiple_of(4) {
+            return Err(refused("a budget's points must be a multiple of 4".into()));
+        }
+        if self.pairs == Some(0) {
+            return Err(refused("a budget must have a pair to test on at least".into()));
+        }
+        let learning = self.training.values().chain([&self.adaptation]);
+        for Learning { learning_rate, batch, .. } in learning {
+            if batch.unwrap_or(self.batch) == 0 || !(*learning_rate > 0.0 && learning_rate.is_finite()) {
+                return Err(refused("batches and step sizes must be positive".into()));
+            }
+        }
+        Ok(())
     }
 
     /// How the network of that name is trained on clouds of so many points, with changes as in `upcr train --set`.
@@ -146,5 +169,12 @@ mod tests {
         let quick = Budget::by_name("quick").unwrap();
         assert!(quick.training("icp", 64, &[], 0).is_err());
         assert!(quick.training("upcr", 64, &["network.k=none".into()], 0).is_err());
+        for wrong in [
+            Budget { points: 1025, ..quick.clone() },
+            Budget { pairs: Some(0), ..quick.clone() },
+            Budget { batch: 0, ..quick.clone() },
+        ] {
+            assert!(wrong.check().is_err());
+        }
     }
 }

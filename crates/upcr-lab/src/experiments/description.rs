@@ -1,11 +1,14 @@
 //! What an experiment is: data, pairs, methods and the paper's figures, as a TOML file has them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 use upcr::{Error, Result};
 
+use super::report::is_measure;
 use crate::data::pairs::{Coverage, MotionLaw, Protocol};
+use crate::eval::methods::EvaluatedMethod;
+use crate::models::LearnedConfig;
 
 /// Measured values by the names of their measures.
 pub type Values = BTreeMap<String, f64>;
@@ -185,20 +188,32 @@ impl Experiment {
         Ok(experiment)
     }
 
+    /// Refuses what would fail, or mislead, hours later.
     fn check(&self) -> Result<()> {
-        let names: Vec<&str> = self.settings.iter().map(|setting| setting.name.as_str()).collect();
-        if names.is_empty() || self.methods.is_empty() || self.seeds == 0 {
-            return Err(refused("an experiment needs a setting, a method and a seed at least".into()));
+        let Self { settings, methods, columns, learn_overlaps, .. } = self;
+        if settings.is_empty() || methods.is_empty() || columns.is_empty() || learn_overlaps.is_empty() {
+            return Err(refused("an experiment needs a setting, a method, a column and an overlap".into()));
+        }
+        if self.seeds == 0 || (self.seeds > 1 && self.measure == Measure::Time) {
+            return Err(refused("an experiment needs a seed, and of times no more than one".into()));
+        }
+        let names: Vec<&str> = settings.iter().map(|setting| setting.name.as_str()).collect();
+        distinct("setting", names.iter().copied())?;
+        distinct("method", methods.iter().map(|method| method.name.as_str()))?;
+        let plotted = self.plot.iter().map(|plot| &plot.measure);
+        if let Some(unknown) = columns.iter().chain(plotted).find(|name| !is_measure(name)) {
+            return Err(refused(format!("there is no measure {unknown}")));
+        }
+        if let Some(setting) = settings.iter().find(|setting| !(0.0..=1.0).contains(&setting.outliers)) {
+            return Err(refused(format!("{}: outliers must be a share, 0 to 1", setting.name)));
         }
         let known = |name: &String| match names.contains(&name.as_str()) {
             true => Ok(()),
             false => Err(refused(format!("there is no setting {name}"))),
         };
-        for method in &self.methods {
+        for method in methods {
+            method.check()?;
             method.settings.iter().chain(method.paper.keys()).try_for_each(known)?;
-            if method.run.is_none() && method.network.is_none() {
-                return Err(refused(format!("{} has neither a network nor what to run", method.name)));
-            }
         }
         self.plot.iter().flat_map(|plot| &plot.settings).try_for_each(known)
     }
@@ -225,10 +240,45 @@ impl Setting {
 }
 
 impl Method {
+    fn check(&self) -> Result<()> {
+        let refused = |reason: &str| Err(refused(format!("{}: {reason}", self.name)));
+        if let Some(run) = &self.run {
+            EvaluatedMethod::by_name(run)?;
+        }
+        if let Some(network) = &self.network {
+            LearnedConfig::by_name(network)?;
+        }
+        let learns_alone = self.network.as_deref().is_some_and(|network| network == "upcr");
+        match (&self.run, &self.network) {
+            (None, None) => return refused("has neither a network nor what to run"),
+            (Some(_), Some(_)) if !learns_alone => {
+                return refused("only UPCR's network is run by other methods");
+            }
+            _ => {}
+        }
+        if self.adapt != Adapt::Not && !learns_alone {
+            return refused("only UPCR's network learns without labels");
+        }
+        if self.paper.values().flat_map(Values::values).any(|value| !value.is_finite()) {
+            return refused("the paper's figures must be finite");
+        }
+        Ok(())
+    }
+
     /// Whether it is tested in that setting.
     pub fn is_tested_in(&self, setting: &Setting) -> bool {
         self.settings.is_empty() || self.settings.contains(&setting.name)
     }
+}
+
+fn distinct<'a>(what: &str, names: impl Iterator<Item = &'a str>) -> Result<()> {
+    let mut seen = BTreeSet::new();
+    for name in names {
+        if !seen.insert(name) {
+            return Err(refused(format!("there are two of the {what} {name}")));
+        }
+    }
+    Ok(())
 }
 
 pub(super) fn refused(reason: String) -> Error {

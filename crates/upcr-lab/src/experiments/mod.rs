@@ -51,8 +51,10 @@ pub fn by_name(name: &str) -> Result<Experiment> {
 mod tests {
     use std::collections::BTreeMap;
 
+    use super::reproduce::Measured;
     use super::*;
     use crate::data::pairs::Coverage;
+    use crate::drawing;
 
     /// A data folder with empty data sets of these names.
     fn root(names: &[&str]) -> tempfile::TempDir {
@@ -133,6 +135,65 @@ mod tests {
         assert!(adapts("UPC, shared") && !adapts("UPC, own"));
     }
 
+    /// Results of two methods, one of which has a value of two seeds and one nothing.
+    fn outcome(plot: &str, value: f64) -> Outcome {
+        let text = format!(
+            "title = \"a\"\npaper = \"b\"\ncolumns = [\"recall\", \"found\"]\nplot = {{ kind = \"{plot}\", measure = \
+             \"recall\" }}\n[[setting]]\nname = \"c, d\"\n[[method]]\nname = \"e|f\"\nrun = \"icp\"\n[[method]]\nname = \
+             \"g\"\nrun = \"fgr\"\npaper.\"c, d\" = {{ recall = 0.25 }}\n"
+        );
+        let cell = |seed: u64, value: f64| Measured {
+            setting: "c, d".into(),
+            method: "e|f".into(),
+            seed,
+            weights: None,
+            values: [("recall".to_owned(), value), ("found".to_owned(), 3.0), ("pairs".to_owned(), 4.0)]
+                .into(),
+        };
+        Outcome {
+            name: "x".into(),
+            experiment: Experiment::from_toml(&text).unwrap(),
+            data: Some("y".into()),
+            learned_from: None,
+            cells: vec![cell(0, value), cell(1, 3.0 * value)],
+        }
+    }
+
+    #[test]
+    fn reports_hold_what_was_measured_and_what_the_paper_says() {
+        let results = Results {
+            version: "1".into(),
+            budget_name: "quick".into(),
+            budget: Budget::by_name("quick").unwrap(),
+            threads: 2,
+            finished: true,
+            experiments: vec![outcome("dots", 0.5)],
+            learned: Vec::new(),
+        };
+        let text = markdown(&results, "upcr reproduce x");
+        let row = "| e\\|f | 1.000 ± 0.707 | 3 of 4 |  |";
+        assert!(text.contains(row) && text.contains("| g |  |  | 0.250 |"), "{text}");
+        assert!(text.contains("(x.svg)") && text.contains("points = 256"), "{text}");
+        let table = csv(&results.experiments[0]);
+        assert_eq!(table.lines().nth(1), Some("x,y,\"c, d\",e|f,0,0.5,3,,"), "{table}");
+        assert_eq!(table.lines().count(), 3);
+    }
+
+    #[test]
+    fn pictures_are_drawn_of_any_values_but_none() {
+        for plot in ["dots", "lines"] {
+            for value in [1e-9, 0.5, 1e9] {
+                let outcome = outcome(plot, value);
+                let picture = picture(&outcome).unwrap();
+                assert!(drawing::svg(&picture).unwrap().contains("e|f"));
+                assert!(drawing::png(&picture).unwrap().len() > 1000);
+            }
+            let mut nothing = outcome(plot, 0.0);
+            nothing.experiment.methods.truncate(1);
+            assert!(picture(&nothing).is_none());
+        }
+    }
+
     #[test]
     fn what_is_no_experiment_is_refused() {
         let start = "title = \"a\"\npaper = \"b\"\ndata = [\"c\"]\ncolumns = [\"recall\"]\n";
@@ -147,6 +208,13 @@ mod tests {
             format!("{whole}paper.f = {{ recall = 1.0 }}\n"),
             format!("{start}{setting}[[method]]\nname = \"e\"\n"),
             format!("colour = 3\n{whole}"),
+            format!("{whole}adapt = \"tested\"\n"),
+            format!("{whole}network = \"prnet\"\n"),
+            format!("{whole}{method}"),
+            format!("{start}{setting}{setting}{method}"),
+            format!("{start}{setting}outliers = 1.5\n{method}"),
+            whole.replace("recall", "beauty"),
+            whole.replace("icp", "magic"),
         ] {
             assert!(Experiment::from_toml(&text).is_err(), "{text}");
         }

@@ -1,6 +1,7 @@
 //! What an experiment takes: the networks that must have learned, and the tests. Whatever is the same has the same name,
 //! in whichever experiment it stands, and is done once.
 
+use std::fmt;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
@@ -75,6 +76,16 @@ pub struct Cell {
     pub seed: u64,
     /// What is done.
     pub test: Test,
+}
+
+impl fmt::Display for Weights {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.training.network {
+            LearnedConfig::Upcr(config) => write!(f, "upcr ({:?}, {:?})", config.invariant, config.rotation)?,
+            _ => f.write_str(&self.network)?,
+        }
+        write!(f, ", seed {}", self.training.seed)
+    }
 }
 
 impl Weights {

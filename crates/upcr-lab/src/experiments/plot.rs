@@ -11,10 +11,10 @@ use super::report::{Spread, heading};
 use super::reproduce::Outcome;
 use crate::drawing::{CAPTION, COLORS, Drawn, LETTERS, Picture, font, legend};
 
-/// The experiment's picture; `None` where it has none, or nothing was measured.
+/// The experiment's picture; `None` where it has none, or nothing above zero was measured.
 pub fn picture(outcome: &Outcome) -> Option<impl Picture + '_> {
     let plot = outcome.experiment.plot.as_ref()?;
-    Some(Drawing::new(outcome, plot)).filter(|drawing| !drawing.marks.is_empty())
+    Some(Drawing::new(outcome, plot)).filter(|drawing| drawing.range().1 > 0.0)
 }
 
 /// A measured value, or one of the paper's.
@@ -40,6 +40,8 @@ const ROW: u32 = 26;
 const FRAME: u32 = 110;
 const WIDTH: u32 = 860;
 const LINES_HEIGHT: u32 = 460;
+/// Share of the largest value down to which a logarithmic axis reaches.
+const SMALLEST: f64 = 2e-4;
 
 impl<'a> Drawing<'a> {
     fn new(outcome: &'a Outcome, plot: &'a Plot) -> Self {
@@ -85,9 +87,9 @@ impl<'a> Drawing<'a> {
         B::ErrorType: 'static,
     {
         let count = self.methods.len();
-        // Errors below a hundredth of the measure's unit are drawn at it.
+        // A method may be right to the last bit: what is below a share of the largest is drawn at it.
         let (low, high) = self.range();
-        let low = low.max(high * 1e-4).max(1e-2);
+        let low = low.clamp(high * SMALLEST, high);
         let letters = font(LETTERS, unit);
         let mut chart = ChartBuilder::on(area)
             .caption(&self.outcome.experiment.title, font(CAPTION, unit))
@@ -150,7 +152,7 @@ impl<'a> Drawing<'a> {
         B::ErrorType: 'static,
     {
         let (_, high) = self.range();
-        let last = self.settings.iter().map(|(_, x)| *x).fold(0.0, f64::max);
+        let last = self.settings.iter().map(|(_, x)| *x).fold(0.01, f64::max);
         let letters = font(LETTERS, unit);
         let mut chart = ChartBuilder::on(area)
             .caption(&self.outcome.experiment.title, font(CAPTION, unit))

@@ -2,8 +2,12 @@
 
 use std::fmt::Write;
 
-use super::description::{Experiment, Measure, PlotKind};
+use super::description::{Adapt, Experiment, Measure, Part, PlotKind, Values};
+use super::plan::{Adaptation, Weights};
+use super::plot::picture;
 use super::reproduce::{Lesson, Measured, Outcome, Results};
+use crate::eval::run::overlap_name;
+use crate::train::ValidationErrors;
 
 /// A measure: its name, how tables head it, and digits after the point.
 struct Column {
@@ -12,8 +16,8 @@ struct Column {
     digits: usize,
 }
 
-/// Every measure that tables know. Another one is headed by its name.
-static COLUMNS: [Column; 13] = [
+/// Every measure that tables and pictures know.
+static COLUMNS: [Column; 14] = [
     Column { name: "rmse_r_deg", heading: "RMSE(R) °", digits: 3 },
     Column { name: "mae_r_deg", heading: "MAE(R) °", digits: 3 },
     Column { name: "rmse_t", heading: "RMSE(t)", digits: 5 },
@@ -23,6 +27,7 @@ static COLUMNS: [Column; 13] = [
     Column { name: "me_bregier", heading: "ME(T)", digits: 4 },
     Column { name: "recall", heading: "recall", digits: 3 },
     Column { name: "found", heading: "found", digits: 0 },
+    Column { name: "ms_median", heading: "median, ms", digits: 2 },
     Column { name: "features_ms", heading: "features, ms", digits: 2 },
     Column { name: "network_ms", heading: "network, ms", digits: 2 },
     Column { name: "solve_ms", heading: "solve, ms", digits: 2 },
@@ -32,6 +37,11 @@ static COLUMNS: [Column; 13] = [
 /// How a measure is called.
 pub(super) fn heading(measure: &str) -> &str {
     COLUMNS.iter().find(|column| column.name == measure).map_or(measure, |column| column.heading)
+}
+
+/// Whether it is one.
+pub(super) fn is_measure(name: &str) -> bool {
+    COLUMNS.iter().any(|column| column.name == name)
 }
 
 fn digits(measure: &str) -> usize {
@@ -75,7 +85,7 @@ pub fn markdown(results: &Results, command: &str) -> String {
     for outcome in &results.experiments {
         text.push_str(&section(outcome));
     }
-    text.push_str(&lessons(&results.learned));
+    text.push_str(&lessons(&results.learned, results.budget.points));
     text
 }
 
@@ -96,7 +106,16 @@ fn section(outcome: &Outcome) -> String {
         text.push('.');
     }
     let _ = writeln!(text, " {note}\n");
-    if outcome.experiment.plot.is_some() {
+    let missing: Vec<&str> = (outcome.experiment.methods.iter())
+        .filter(|method| outcome.cells.iter().all(|cell| cell.method != method.name))
+        .map(|method| method.name.as_str())
+        .collect();
+    if !missing.is_empty() {
+        let names = outcome.experiment.learn_from.join(", ");
+        let _ =
+            writeln!(text, "Not done, for want of data to learn from ({names}): {}.\n", missing.join(", "));
+    }
+    if picture(outcome).is_some() {
         let _ = writeln!(text, "![{title}]({}.svg)\n", outcome.name);
     }
     let lines = outcome.experiment.plot.as_ref().is_some_and(|plot| plot.kind == PlotKind::Lines);
@@ -166,50 +185,63 @@ fn cell(outcome: &Outcome, setting: &str, method: &str, measure: &str) -> String
 }
 
 fn grid(corner: &str, heads: &[String], rows: Vec<(String, Vec<String>)>) -> String {
-    let mut text = format!("| {corner} | {} |\n| --- |", heads.join(" | "));
-    text.push_str(&" ---: |".repeat(heads.len()));
-    text.push('\n');
-    for (name, cells) in rows {
-        let _ = writeln!(text, "| {name} | {} |", cells.join(" | "));
-    }
+    let line = |first: &str, cells: &[String]| {
+        let cells = cells.iter().map(|cell| cell.replace('|', "\\|"));
+        format!("| {} | {} |\n", first.replace('|', "\\|"), cells.collect::<Vec<_>>().join(" | "))
+    };
+    let mut text = line(corner, heads);
+    let _ = writeln!(text, "| --- |{}", " ---: |".repeat(heads.len()));
+    rows.iter().for_each(|(name, cells)| text.push_str(&line(name, cells)));
     text
 }
 
 /// What has learned, and how.
-fn lessons(learned: &[Lesson]) -> String {
+fn lessons(learned: &[Lesson], points: usize) -> String {
     if learned.is_empty() {
         return String::new();
     }
-    let heads = ["data", "clouds", "steps", "s", "held out: MAE(R) °", "recall"].map(str::to_owned);
-    let rows = learned
-        .iter()
-        .map(|lesson| {
-            let data = match &lesson.of.adaptation {
-                Some(adaptation) => format!(
-                    "{}, {}, on",
-                    adaptation.data,
-                    adaptation.setting.protocol(lesson.of.last().stages[0].points)
-                ),
-                None => format!("{}, {:?}, {:?}", lesson.of.data, lesson.of.part, lesson.of.overlaps),
-            };
-            let held_out = |value: fn(&crate::train::ValidationErrors) -> f64| {
-                lesson.held_out.as_ref().map_or(String::new(), |errors| format!("{:.3}", value(errors)))
-            };
-            let cells = vec![
-                data,
-                lesson.shapes.to_string(),
-                lesson.steps.to_string(),
-                format!("{:.0}", lesson.seconds),
-                held_out(|errors| errors.mae_r_deg),
-                held_out(|errors| errors.recall),
-            ];
-            (format!("`{}`", lesson.weights), cells)
-        })
-        .collect();
+    let heads = ["network", "learned from", "clouds", "steps", "s", "MAE(R) °", "recall"].map(str::to_owned);
+    let rows =
+        learned.iter().map(|lesson| (format!("`{}`", lesson.weights), row_of(lesson, points))).collect();
     format!(
-        "## What has learned\n\nTimes are those of steps, validation excluded.\n\n{}",
+        "## What has learned\n\nTimes are those of steps, validation excluded; errors those on held-out clouds or, where \
+         a network learned on, on its own.\n\n{}",
         grid("weights", &heads, rows)
     )
+}
+
+fn row_of(lesson: &Lesson, points: usize) -> Vec<String> {
+    let Weights { data, part, overlaps, adaptation, .. } = &lesson.of;
+    let learned_from = match adaptation {
+        Some(Adaptation { data, adapt, setting, .. }) => {
+            let clouds = if *adapt == Adapt::Tested { "tested pairs" } else { "training split" };
+            format!("{data}, {clouds}, {}, going on", setting.protocol(points))
+        }
+        None => {
+            let clouds = match part {
+                Part::UnseenClouds => "training split",
+                Part::UnseenCategories => "first half of the categories",
+            };
+            let overlaps: Vec<&str> = overlaps.iter().map(|&overlap| overlap_name(overlap)).collect();
+            format!("{data}, {clouds}, {}", overlaps.join(" and "))
+        }
+    };
+    let found = |value: fn(&ValidationErrors) -> f64| {
+        lesson.held_out.as_ref().map_or(String::new(), |errors| format!("{:.3}", value(errors)))
+    };
+    let steps = match &lesson.failed {
+        None => lesson.steps.to_string(),
+        Some(reason) => format!("{}: {reason}", lesson.steps),
+    };
+    vec![
+        lesson.of.to_string(),
+        learned_from,
+        lesson.shapes.to_string(),
+        steps,
+        format!("{:.0}", lesson.seconds),
+        found(|errors| errors.mae_r_deg),
+        found(|errors| errors.recall),
+    ]
 }
 
 /// An experiment's measurements, one a line: every setting, method and seed, with the paper's figures where it has any.
@@ -223,7 +255,7 @@ pub fn csv(outcome: &Outcome) -> String {
     for cell in &outcome.cells {
         let method = outcome.experiment.methods.iter().find(|method| method.name == cell.method);
         let paper = method.and_then(|method| method.paper.get(&cell.setting));
-        let value = |values: Option<&super::Values>, name: &String| {
+        let value = |values: Option<&Values>, name: &String| {
             values.and_then(|values| values.get(name)).map_or(String::new(), f64::to_string)
         };
         let ours = columns.iter().map(|name| value(Some(&cell.values), name));
@@ -231,8 +263,8 @@ pub fn csv(outcome: &Outcome) -> String {
         let _ = writeln!(
             text,
             "{},{},{},{},{},{}",
-            outcome.name,
-            outcome.data.as_deref().unwrap_or_default(),
+            quoted(&outcome.name),
+            quoted(outcome.data.as_deref().unwrap_or_default()),
             quoted(&cell.setting),
             quoted(&cell.method),
             cell.seed,
@@ -243,5 +275,9 @@ pub fn csv(outcome: &Outcome) -> String {
 }
 
 fn quoted(text: &str) -> String {
-    if text.contains([',', '"']) { format!("\"{}\"", text.replace('"', "\"\"")) } else { text.to_owned() }
+    if text.contains([',', '"', '\n', '\r']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text.to_owned()
+    }
 }

@@ -56,6 +56,8 @@ pub struct Results {
     pub budget: Budget,
     /// Threads that were used.
     pub threads: usize,
+    /// Whether all of the experiments that were asked for are here.
+    pub finished: bool,
     /// By experiment.
     pub experiments: Vec<Outcome>,
     /// The networks that have learned for them.
@@ -107,6 +109,9 @@ pub struct Lesson {
     pub seconds: f64,
     /// On clouds that it did not learn from, or on its own where it learned on.
     pub held_out: Option<ValidationErrors>,
+    /// Why it could not go on; there are no weights then.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub failed: Option<String>,
 }
 
 /// A run of experiments.
@@ -125,15 +130,19 @@ pub struct Reproduction {
 }
 
 impl Reproduction {
-    /// Does what has not been done of the experiments, by name. `None` where it was stopped.
+    /// Does what has not been done of the experiments, by name. Where it was stopped, the results are those of the
+    /// experiments that were finished, and not all of them. A network that fails to learn leaves its cells empty.
     ///
     /// # Errors
-    /// Where an experiment cannot be planned, data cannot be read, learning fails, or the folder cannot be written to.
+    /// Where an experiment cannot be planned, data cannot be read, the folder cannot be written to or holds what was made
+    /// otherwise.
     pub fn run(
         &self,
         experiments: &[(String, Experiment)],
         spectator: &mut dyn Spectator,
-    ) -> Result<Option<Results>> {
+    ) -> Result<Results> {
+        self.budget.check()?;
+        self.claim_folder()?;
         let plans = experiments
             .iter()
             .map(|(_, experiment)| experiment.plan(&self.budget, &self.data))
@@ -142,7 +151,7 @@ impl Reproduction {
         let mut store = Store { run: self, shapes: BTreeMap::new() };
         let mut learned = BTreeMap::new();
         let mut outcomes = Vec::new();
-        for ((name, experiment), plan) in experiments.iter().zip(plans) {
+        'experiments: for ((name, experiment), plan) in experiments.iter().zip(plans) {
             let data = plan.as_ref().and_then(|cells| cells.first()).map(|cell| cell.test.data.clone());
             let mut learners = plan.iter().flatten().filter_map(|cell| cell.test.weights.as_ref());
             let learned_from = learners.next().map(|weights| weights.data.clone());
@@ -150,30 +159,73 @@ impl Reproduction {
             for Cell { setting, method, seed, test } in plan.into_iter().flatten() {
                 let mut told = Told { tasks: &mut tasks, spectator: &mut *spectator, experiment: name };
                 if let Some(weights) = test.weights.as_ref().filter(|_| test.measure == Measure::Errors) {
-                    let Some(lessons) = store.learn(weights, &mut told)? else { return Ok(None) };
+                    let Some(lessons) = store.learn(weights, &mut told)? else { break 'experiments };
                     learned.extend(lessons.into_iter().map(|lesson| (lesson.weights.clone(), lesson)));
                 }
                 if told.spectator.stop() {
-                    return Ok(None);
+                    break 'experiments;
                 }
-                let values = store.test(&test, &format!("{method}, {setting}"), &mut told)?;
+                let failed = |weights: &Weights| learned.get(&weights.id()).is_some_and(Lesson::has_failed);
+                let values = if test.weights.as_ref().is_some_and(failed) {
+                    told.is_done(&test.id());
+                    Values::new()
+                } else {
+                    store.test(&test, &format!("{method}, {setting}"), &mut told)?
+                };
                 cells.push(Measured { setting, method, seed, weights: test.weights.map(|w| w.id()), values });
             }
             let experiment = experiment.clone();
             outcomes.push(Outcome { name: name.clone(), experiment, data, learned_from, cells });
         }
-        Ok(Some(Results {
+        Ok(Results {
             version: env!("CARGO_PKG_VERSION").into(),
             budget_name: self.budget_name.clone(),
             budget: self.budget.clone(),
             threads: rayon::current_num_threads(),
+            finished: outcomes.len() == experiments.len(),
             experiments: outcomes,
             learned: learned.into_values().collect(),
-        }))
+        })
+    }
+
+    /// Sees that what stands in the folder was made as it would be made now.
+    fn claim_folder(&self) -> Result<()> {
+        let made = Made {
+            version: env!("CARGO_PKG_VERSION").into(),
+            data: self.data.canonicalize().unwrap_or_else(|_| self.data.clone()),
+            device: format!("{:?}", self.device),
+            threads: rayon::current_num_threads(),
+        };
+        let path = self.folder.join("made.json");
+        match read_json::<Made>(&path)? {
+            None => write_json(&path, &made),
+            Some(before) if before == made => Ok(()),
+            Some(before) => {
+                let reason =
+                    format!("holds what was made otherwise ({before:?}, now {made:?}); take another folder");
+                Err(Error::Unsupported { path: self.folder.clone(), reason })
+            }
+        }
     }
 
     fn weights_folder(&self, weights: &Weights) -> PathBuf {
         self.folder.join("weights").join(weights.id())
+    }
+}
+
+/// What a folder's contents depend on beside what names them.
+#[derive(Debug, PartialEq, Serialize, Deserialize)]
+struct Made {
+    version: String,
+    data: PathBuf,
+    device: String,
+    /// Times depend on them.
+    threads: usize,
+}
+
+impl Lesson {
+    fn has_failed(&self) -> bool {
+        self.failed.is_some()
     }
 }
 
@@ -193,7 +245,13 @@ impl Store<'_> {
         let mut lessons = Vec::new();
         if weights.adaptation.is_some() {
             let Some(before) = self.learn(&weights.unadapted(), told)? else { return Ok(None) };
+            let failed = before.iter().find(|lesson| lesson.has_failed()).cloned();
             lessons.extend(before);
+            if let Some(failed) = failed {
+                told.is_done(&weights.id());
+                lessons.push(Lesson { weights: weights.id(), of: weights.clone(), ..failed });
+                return Ok(Some(lessons));
+            }
         }
         let folder = self.run.weights_folder(weights);
         if let Some(lesson) = read_json(&folder.join(LESSON))? {
@@ -207,7 +265,9 @@ impl Store<'_> {
             Some(_) => self.adapt(weights, &folder, told)?,
         };
         let Some((network, lesson)) = learned else { return Ok(None) };
-        write_atomically(&folder.join(WEIGHTS), &network.store().to_bytes()?)?;
+        if !lesson.has_failed() {
+            write_atomically(&folder.join(WEIGHTS), &network.store().to_bytes()?)?;
+        }
         write_json(&folder.join(LESSON), &lesson)?;
         lessons.push(lesson);
         Ok(Some(lessons))
@@ -220,13 +280,17 @@ impl Store<'_> {
         told: &mut Told,
     ) -> Result<Option<(Learned, Lesson)>> {
         let shapes = self.shapes(&weights.data, weights.part, false)?;
-        told.starts(&format!("training {}", named(weights)));
+        told.starts(&format!("training {weights}"));
         let begun = Instant::now();
         let mut trainer = Trainer::start(weights.training.clone(), folder, &self.run.device)?;
         let done_before = trainer.steps();
-        if !trainer.run(&shapes, &mixture(weights), told.spectator)? {
-            return Ok(None);
-        }
+        let failed = match trainer.run(&shapes, &mixture(weights), told.spectator) {
+            Ok(true) => None,
+            Ok(false) => return Ok(None),
+            // It would fail again, and the others need not wait for it.
+            Err(Error::Diverged { step }) => Some(format!("diverged at step {step}")),
+            Err(error) => return Err(error),
+        };
         write_history(folder, trainer.history())?;
         told.ends(&weights.id(), trainer.steps() - done_before, begun.elapsed());
         let lesson = Lesson {
@@ -235,7 +299,8 @@ impl Store<'_> {
             shapes: shapes.len(),
             steps: trainer.steps(),
             seconds: trainer.seconds(),
-            held_out: trainer.history().last().and_then(|event| event.validation),
+            held_out: trainer.history().last().and_then(|event| event.validation).filter(is_finite),
+            failed,
         };
         Ok(Some((trainer.network().clone(), lesson)))
     }
@@ -253,10 +318,9 @@ impl Store<'_> {
             Arc::make_mut(&mut shapes).truncate(adaptation.pairs.unwrap_or(usize::MAX));
         }
         let config = adaptation.training.clone();
-        told.starts(&format!("{} learns on", named(weights)));
+        told.starts(&format!("{weights} learns on"));
         let begun = Instant::now();
         let before = self.load(&weights.unadapted())?;
-        // Clouds that keep as many of their points as the stage has are made of a whole cloud's.
         let mixture = vec![(adaptation.setting.protocol(self.run.budget.points), 1.0)];
         let poses = if tested { Poses::Fixed } else { Poses::Fresh };
         let found = adapt(&before, &shapes, &mixture, poses, config, folder, told.spectator)?;
@@ -270,7 +334,8 @@ impl Store<'_> {
             shapes: shapes.len(),
             steps: found.steps,
             seconds: found.seconds,
-            held_out: Some(found.errors[usize::from(found.helped)]),
+            held_out: Some(found.errors[usize::from(found.helped)]).filter(is_finite),
+            failed: None,
         };
         Ok(Some((found.network, lesson)))
     }
@@ -292,7 +357,7 @@ impl Store<'_> {
         let begun = Instant::now();
         let values = match test.measure {
             Measure::Errors => self.errors(test)?,
-            Measure::Time => timing::times(test, &self.run.device)?,
+            Measure::Time => timing::times(test)?,
         };
         let folder = self.run.folder.join("tests");
         fs::create_dir_all(&folder).map_err(|source| Error::Io { path: folder, source })?;
@@ -311,7 +376,7 @@ impl Store<'_> {
             None => {
                 let shapes = self.shapes(&test.data, test.setting.shapes, true)?;
                 let protocol = test.setting.protocol(test.points);
-                let count = shapes.len().min(test.pairs.unwrap_or(usize::MAX));
+                let count = some_of(shapes.len(), test)?;
                 let pair = |item: usize| protocol.pair(&shapes.points(item), item as u64);
                 let tolerance = |pair: &data::pairs::Pair| Tolerance::object(diameter(&pair.source.points));
                 evaluate_pairs(&method, &settings, count, pair, tolerance, &mut |_| {})?
@@ -319,7 +384,7 @@ impl Store<'_> {
             Some(gap) => {
                 let (frames, _) = seven_scenes::frames(&self.run.data.join(&test.data), Split::All)?;
                 let pairs = seven_scenes::frame_pairs(&frames, gap);
-                let count = pairs.len().min(test.pairs.unwrap_or(usize::MAX));
+                let count = some_of(pairs.len(), test)?;
                 // Evenly over the sequences.
                 let pair = |item: usize| seven_scenes::read_pair(pairs[item * pairs.len() / count]);
                 evaluate_pairs(&method, &settings, count, pair, |_| Tolerance::INDOOR, &mut |_| {})?
@@ -347,6 +412,11 @@ impl Store<'_> {
     }
 }
 
+/// A file has no other numbers.
+fn is_finite(errors: &ValidationErrors) -> bool {
+    [errors.loss, errors.mae_r_deg, errors.mae_t, errors.recall].iter().all(|value| value.is_finite())
+}
+
 /// A trained network as a method: alone, or within one of `upcr eval`.
 fn method_of(network: Learned, run: Option<&str>) -> Result<EvaluatedMethod> {
     match (&network, run) {
@@ -363,6 +433,15 @@ fn method_of(network: Learned, run: Option<&str>) -> Result<EvaluatedMethod> {
     }
 }
 
+/// How many of so many pairs are tested on.
+fn some_of(pairs: usize, test: &Test) -> Result<usize> {
+    if pairs == 0 {
+        let reason = format!("{}: there are no pairs of {:?}", test.data, test.setting);
+        return Err(Error::InvalidSetting { name: "experiment", reason });
+    }
+    Ok(pairs.min(test.pairs.unwrap_or(usize::MAX)))
+}
+
 /// Pairs to learn from: each of the overlaps as often.
 fn mixture(weights: &Weights) -> Mixture {
     weights.overlaps.iter().map(|&coverage| (Protocol { coverage, ..Protocol::CONSISTENT }, 1.0)).collect()
@@ -375,15 +454,6 @@ fn values(row: &Row) -> Values {
         _ => serde_json::Map::new(),
     };
     fields.into_iter().filter_map(|(name, value)| Some((name, value.as_f64()?))).collect()
-}
-
-fn named(weights: &Weights) -> String {
-    let seed = weights.training.seed;
-    let network = match &weights.training.network {
-        LearnedConfig::Upcr(config) => format!("upcr ({:?}, {:?})", config.invariant, config.rotation),
-        _ => weights.network.clone(),
-    };
-    format!("{network}, seed {seed}")
 }
 
 /// What tasks of one kind have in common: they take so long for each unit of work.
@@ -408,7 +478,7 @@ impl Pace {
         let steps = |length: Length| match length {
             Length::Steps(steps) => steps,
             // Of a data set of usual size.
-            Length::Epochs(epochs) => epochs * 100,
+            Length::Epochs(epochs) => epochs.saturating_mul(100),
         };
         let config = weights.last();
         let work = config.stages.iter().map(|stage| steps(stage.length)).sum();
@@ -492,7 +562,7 @@ impl Told<'_> {
 
     /// Crosses a task off that took so long for so much work.
     fn ends(&mut self, id: &str, work: u64, time: Duration) {
-        if let Some(pace) = self.tasks.open.remove(id) {
+        if let Some(pace) = self.tasks.open.remove(id).filter(|_| work > 0) {
             let spent = self.tasks.spent.entry(pace.kind).or_default();
             spent.learning = pace.learns;
             spent.seconds += time.as_secs_f64();

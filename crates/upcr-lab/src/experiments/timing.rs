@@ -14,14 +14,14 @@ use super::description::Values;
 use super::plan::Test;
 use crate::data::pairs::{Pair, Protocol};
 use crate::eval::methods::EvaluatedMethod;
-use crate::models::{CloudInput, Learned};
+use crate::models::Learned;
 use crate::random;
 
 /// Pairs that are timed, after one that is not.
 const REPEATS: usize = 15;
 
 /// Medians over pairs of an object's points, in milliseconds. What is not told apart is left out.
-pub(super) fn times(test: &Test, device: &Device) -> Result<Values> {
+pub(super) fn times(test: &Test) -> Result<Values> {
     let pairs = (0..=REPEATS as u64)
         .map(|seed| Protocol::CONSISTENT.keeping(test.points).pair(&object(seed, test.points), seed))
         .collect::<Result<Vec<_>>>()?;
@@ -51,18 +51,16 @@ pub(super) fn times(test: &Test, device: &Device) -> Result<Values> {
             parts.extend([("features_ms", features), ("solve_ms", total - features), ("total_ms", total)]);
         }
         Some(weights) => {
-            let network = weights.training.network.init(0, device)?;
-            if let Learned::Upcr(upcr) = &network {
-                let config = &upcr.config;
-                let features = median(&pairs, |pair| {
-                    let [source, target] = [single(&pair.source), single(&pair.target)];
-                    let (a, b) =
-                        join(|| CloudInput::new(&source, config), || CloudInput::new(&target, config));
-                    Ok((a?, b?))
-                })?;
+            let network = weights.training.network.init(0, &Device::flex())?;
+            if matches!(network, Learned::Upcr(_)) {
                 let network = Network::from_safetensors(&network.store().to_bytes()?)?;
                 let total =
                     median(&pairs, |pair| network.predict(&single(&pair.source), &single(&pair.target)))?;
+                let features = median(&pairs, |pair| {
+                    let [source, target] = [single(&pair.source), single(&pair.target)];
+                    let (a, b) = join(|| network.features(&source), || network.features(&target));
+                    Ok((a?, b?))
+                })?;
                 parts.extend([
                     ("features_ms", features),
                     ("network_ms", total - features),

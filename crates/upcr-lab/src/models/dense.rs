@@ -6,6 +6,7 @@ use rand::Rng;
 
 use super::layers::{Init, Statistics, towards};
 use crate::ops;
+use crate::ops::graph_layer::EPSILON;
 
 /// A linear map of channels: PyTorch's `Linear`, and its convolutions over single points.
 #[derive(Module, Debug)]
@@ -69,9 +70,6 @@ pub struct BatchNorm {
     /// `[channels]`.
     pub running_var: Param<Tensor<1>>,
 }
-
-/// What batch norm adds to a variance.
-const EPSILON: f64 = 1e-5;
 
 impl BatchNorm {
     pub(super) fn init(channels: usize, init: &mut Init<impl Rng>) -> Self {

@@ -39,6 +39,9 @@ pub(super) fn product_with_stride(
 ) {
     assert!(left.holds(rows, inner) && right.holds(inner, columns) && columns <= stride);
     assert!(rows == 0 || out.len() >= (rows - 1) * stride + columns);
+    if rows == 0 {
+        return;
+    }
     let panel = panel(columns);
     for first in (0..columns).step_by(panel) {
         // SAFETY: all entries lie in their slices, as asserted, of which the panel has a part; `out` is borrowed alone.

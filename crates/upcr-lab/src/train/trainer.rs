@@ -304,8 +304,7 @@ impl Trainer {
         let (loss, statistics) = self.network.learn(batch, seed)?;
         let value = f64::from(loss.clone().into_scalar::<f32>());
         if !value.is_finite() {
-            let reason = format!("the loss became {value} at step {}", self.state.step);
-            return Err(Error::InvalidSetting { name: "learning_rate", reason });
+            return Err(Error::Diverged { step: self.state.step });
         }
         let gradients = GradientsParams::from_grads(loss.backward(), &self.network);
         let network = self.optimizer.step(rate, self.network.clone(), gradients);

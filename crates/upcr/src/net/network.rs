@@ -188,6 +188,18 @@ impl Network {
         })
     }
 
+    /// What the second branch starts from: φ over the edges of the cloud, with the neighbours that these lead to.
+    ///
+    /// # Errors
+    /// Where the cloud is empty or holds a coordinate that is not finite.
+    pub fn features(&self, cloud: &[[f32; 3]]) -> Result<InvariantInputs> {
+        check(cloud, CloudRole::Cloud)?;
+        self.rooms.with(|room| {
+            self.prepare(cloud, self.config.k, room)?;
+            Ok(room.inputs.clone())
+        })
+    }
+
     fn pose(&self, cloud: &[[f32; 3]], role: CloudRole, k: usize) -> Result<Rigid> {
         self.rooms.with(|room| {
             self.run(cloud, role, k, room)?;
