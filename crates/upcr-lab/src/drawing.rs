@@ -3,7 +3,7 @@
 use std::error::Error as StdError;
 use std::sync::Once;
 
-use plotters::coord::{CoordTranslate, Shift};
+use plotters::coord::Shift;
 use plotters::prelude::*;
 use plotters::style::{FontStyle, RGBColor, register_font};
 use upcr::{Error, Result};
@@ -82,29 +82,6 @@ pub fn png(picture: &impl Picture) -> Result<Vec<u8>> {
 /// A font of so many units.
 pub fn font(size: u32, unit: u32) -> (&'static str, u32) {
     ("sans-serif", size * unit)
-}
-
-/// The names of what a chart has drawn.
-///
-/// # Errors
-/// Where the backend fails.
-pub fn legend<'a, B: DrawingBackend + 'a, C: CoordTranslate>(
-    chart: &mut ChartContext<'a, B, C>,
-    position: SeriesLabelPosition,
-    unit: u32,
-) -> Drawn
-where
-    B::ErrorType: 'static,
-{
-    chart
-        .configure_series_labels()
-        .position(position)
-        .label_font(font(LETTERS, unit))
-        .legend_area_size(22 * unit)
-        .background_style(WHITE.mix(0.85))
-        .border_style(BLACK.mix(0.3))
-        .draw()?;
-    Ok(())
 }
 
 fn drawn<B: DrawingBackend>(picture: &impl Picture, area: &DrawingArea<B, Shift>, unit: u32) -> Result<()>

@@ -351,7 +351,7 @@ fn a_reproduction_stops_when_it_is_told_to() {
     let scratch = Scratch::new();
     shapes(&scratch);
     let experiment = scratch.file("boxes.toml", EXPERIMENT);
-    let budget = scratch.file("long.toml", &BUDGET.replace("steps = 30", "steps = 1000000"));
+    let budget = scratch.file("long.toml", BUDGET.replace("steps = 30", "steps = 1000000"));
     let out = scratch.path("out");
     let arguments =
         ["reproduce", &experiment, "--budget", &budget, "--data", &scratch.path(""), "--out", &out];

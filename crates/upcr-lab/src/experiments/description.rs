@@ -207,9 +207,11 @@ impl Experiment {
         if let Some(setting) = settings.iter().find(|setting| !(0.0..=1.0).contains(&setting.outliers)) {
             return Err(refused(format!("{}: outliers must be a share, 0 to 1", setting.name)));
         }
-        let known = |name: &String| match names.contains(&name.as_str()) {
-            true => Ok(()),
-            false => Err(refused(format!("there is no setting {name}"))),
+        let known = |name: &String| {
+            if names.contains(&name.as_str()) {
+                return Ok(());
+            }
+            Err(refused(format!("there is no setting {name}")))
         };
         for method in methods {
             method.check()?;
@@ -220,7 +222,7 @@ impl Experiment {
 
     /// Points of the clouds that are learned from, made of so many.
     pub fn learned_points(&self, points: usize) -> usize {
-        let kept = |&coverage: &Coverage| Protocol { coverage, points, ..Protocol::CONSISTENT }.kept();
+        let kept = |&coverage: &Coverage| Protocol { points, coverage, ..Protocol::CONSISTENT }.kept();
         self.learn_overlaps.iter().map(kept).min().unwrap_or(points)
     }
 }

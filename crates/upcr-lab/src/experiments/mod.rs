@@ -37,14 +37,13 @@ pub fn names() -> impl Iterator<Item = &'static str> {
 /// # Errors
 /// Where there is none.
 pub fn by_name(name: &str) -> Result<Experiment> {
-    match EXPERIMENTS.iter().find(|(known, _)| *known == name) {
-        Some((_, text)) => Experiment::from_toml(text),
-        None => {
-            let known = names().collect::<Vec<_>>().join(", ");
-            let reason = format!("there is no {name}; there are {known}");
-            Err(Error::InvalidSetting { name: "experiment", reason })
-        }
-    }
+    let found = EXPERIMENTS.iter().find(|(known, _)| *known == name);
+    let (_, text) = found.ok_or_else(|| {
+        let known = names().collect::<Vec<_>>().join(", ");
+        let reason = format!("there is no {name}; there are {known}");
+        Error::InvalidSetting { name: "experiment", reason }
+    })?;
+    Experiment::from_toml(text)
 }
 
 #[cfg(test)]
@@ -59,7 +58,9 @@ mod tests {
     /// A data folder with empty data sets of these names.
     fn root(names: &[&str]) -> tempfile::TempDir {
         let folder = tempfile::tempdir().unwrap();
-        names.iter().for_each(|name| std::fs::create_dir(folder.path().join(name)).unwrap());
+        for name in names {
+            std::fs::create_dir(folder.path().join(name)).unwrap();
+        }
         folder
     }
 

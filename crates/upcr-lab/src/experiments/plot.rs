@@ -1,6 +1,9 @@
 //! Results as pictures: a row of marks for each method, or a line over growing disturbance.
 
+use std::ops::Range;
+
 use plotters::coord::Shift;
+use plotters::coord::ranged1d::{AsRangedCoord, ValueFormatter};
 use plotters::element::{Drawable, PointCollection};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
@@ -9,7 +12,7 @@ use plotters_backend::{BackendCoord, DrawingErrorKind};
 use super::description::{Plot, PlotKind};
 use super::report::{Spread, heading};
 use super::reproduce::Outcome;
-use crate::drawing::{CAPTION, COLORS, Drawn, LETTERS, Picture, font, legend};
+use crate::drawing::{CAPTION, COLORS, Drawn, LETTERS, Picture, font};
 
 /// The experiment's picture; `None` where it has none, or nothing above zero was measured.
 pub fn picture(outcome: &Outcome) -> Option<impl Picture + '_> {
@@ -38,8 +41,9 @@ struct Drawing<'a> {
 /// Heights of a row and of all else, and widths, in units.
 const ROW: u32 = 26;
 const FRAME: u32 = 110;
-const WIDTH: u32 = 860;
+const WIDTH: u32 = 980;
 const LINES_HEIGHT: u32 = 460;
+const KEY: u32 = 170;
 /// Share of the largest value down to which a logarithmic axis reaches.
 const SMALLEST: f64 = 2e-4;
 
@@ -82,28 +86,49 @@ impl<'a> Drawing<'a> {
         (low, high)
     }
 
+    /// Over a logarithmic axis, where values differ tenfold.
     fn dots<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
     where
         B::ErrorType: 'static,
     {
-        let count = self.methods.len();
         // A method may be right to the last bit: what is below a share of the largest is drawn at it.
         let (low, high) = self.range();
         let low = low.clamp(high * SMALLEST, high);
+        if high > 10.0 * low {
+            self.dots_over(area, unit, (low * 0.7..high * 1.4).log_scale(), low * 0.7..high * 1.4)
+        } else {
+            self.dots_over(area, unit, 0.0..high * 1.1, 0.0..high * 1.1)
+        }
+    }
+
+    fn dots_over<B: DrawingBackend, X: AsRangedCoord<Value = f64>>(
+        &self,
+        area: &DrawingArea<B, Shift>,
+        unit: u32,
+        axis: X,
+        Range { start, end }: Range<f64>,
+    ) -> Drawn
+    where
+        B::ErrorType: 'static,
+        X::CoordDescType: ValueFormatter<f64>,
+    {
+        let count = self.methods.len();
         let letters = font(LETTERS, unit);
-        let mut chart = ChartBuilder::on(area)
+        let (area, beside) = area.split_horizontally((WIDTH - KEY) * unit);
+        let mut key = Vec::new();
+        let mut chart = ChartBuilder::on(&area)
             .caption(&self.outcome.experiment.title, font(CAPTION, unit))
             .margin(12 * unit)
             .x_label_area_size(40 * unit)
             .y_label_area_size(230 * unit)
-            .build_cartesian_2d((low * 0.7..high * 1.4).log_scale(), -0.5..count as f64 - 0.5)?;
+            .build_cartesian_2d(axis, -0.5..count as f64 - 0.5)?;
         chart
             .configure_mesh()
             .disable_y_mesh()
             .disable_y_axis()
             .label_style(letters)
             .x_desc(heading(&self.plot.measure))
-            .x_label_formatter(&|v| format!("{v}"))
+            .x_label_formatter(&short)
             .bold_line_style(BLACK.mix(0.15))
             .light_line_style(BLACK.mix(0.06))
             .y_labels(0)
@@ -112,19 +137,19 @@ impl<'a> Drawing<'a> {
         // Names stand left of the axis, where the mesh has none.
         let style = TextStyle::from(letters.into_font()).pos(Pos::new(HPos::Right, VPos::Center));
         for (index, name) in self.methods.iter().enumerate() {
-            let (x, y) = chart.backend_coord(&(low * 0.7, row(index)));
-            area.draw(&Text::new((*name).to_owned(), (x - 8 * unit as i32, y), style.clone()))?;
+            let (x, y) = chart.backend_coord(&(start, row(index)));
+            area.draw(&Text::new(plain(name), (x - 8 * unit as i32, y), style.clone()))?;
             chart.draw_series([PathElement::new(
-                [(low * 0.7, row(index)), (high * 1.4, row(index))],
+                [(start, row(index)), (end, row(index))],
                 BLACK.mix(0.08).stroke_width(unit),
             )])?;
         }
         let sets = self.settings.len() as f64;
         for (index, (setting, _)) in self.settings.iter().enumerate() {
-            let color = COLORS[index % COLORS.len()];
+            let color = color(index);
             // Settings side by side, the first on top.
             let shift = if sets > 1.0 { 0.22 - 0.44 * index as f64 / (sets - 1.0) } else { 0.0 };
-            let at = |mark: &Mark, value: f64| (value.max(low), row(mark.method) + shift);
+            let at = |mark: &Mark, value: f64| (value.clamp(start, end), row(mark.method) + shift);
             let of_setting = |of_paper: bool| {
                 self.marks.iter().filter(move |mark| mark.setting == index && mark.of_paper == of_paper)
             };
@@ -134,17 +159,15 @@ impl<'a> Drawing<'a> {
             }))?;
             for of_paper in [false, true] {
                 let marks = of_setting(of_paper)
-                    .map(|mark| mark_at(at(mark, mark.value.mean), index, color, of_paper, unit));
-                let series = chart.draw_series(marks)?;
-                let name = if of_paper { format!("{setting}, paper") } else { (*setting).to_owned() };
+                    .map(|mark| mark_at(at(mark, mark.value.mean), index, of_paper, unit));
+                chart.draw_series(marks)?;
                 if of_setting(of_paper).next().is_some() {
-                    series.label(name).legend(move |(x, y)| {
-                        mark_at((x + 8 * unit as i32, y), index, color, of_paper, unit)
-                    });
+                    let name = if of_paper { format!("{setting}, paper") } else { (*setting).to_owned() };
+                    key.push((name, index, of_paper));
                 }
             }
         }
-        legend(&mut chart, SeriesLabelPosition::UpperRight, unit)
+        draw_key(&beside, key, unit)
     }
 
     fn lines<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
@@ -154,7 +177,9 @@ impl<'a> Drawing<'a> {
         let (_, high) = self.range();
         let last = self.settings.iter().map(|(_, x)| *x).fold(0.01, f64::max);
         let letters = font(LETTERS, unit);
-        let mut chart = ChartBuilder::on(area)
+        let (area, beside) = area.split_horizontally((WIDTH - KEY) * unit);
+        let mut key = Vec::new();
+        let mut chart = ChartBuilder::on(&area)
             .caption(&self.outcome.experiment.title, font(CAPTION, unit))
             .margin(12 * unit)
             .x_label_area_size(40 * unit)
@@ -164,22 +189,22 @@ impl<'a> Drawing<'a> {
             .configure_mesh()
             .light_line_style(WHITE)
             .label_style(letters)
+            .x_label_formatter(&short)
+            .y_label_formatter(&short)
             .x_desc("outliers, % of each cloud's points")
             .y_desc(heading(&self.plot.measure))
             .draw()?;
         for (index, name) in self.methods.iter().enumerate() {
-            let color = COLORS[index % COLORS.len()];
+            let color = color(index);
             let points: Vec<(f64, f64)> = (self.marks.iter())
                 .filter(|mark| mark.method == index && !mark.of_paper)
                 .map(|mark| (self.settings[mark.setting].1 * 100.0, mark.value.mean))
                 .collect();
             chart.draw_series(LineSeries::new(points.clone(), color.stroke_width(2 * unit)))?;
-            chart
-                .draw_series(points.into_iter().map(|at| mark_at(at, index, color, false, unit)))?
-                .label(*name)
-                .legend(move |(x, y)| mark_at((x + 8 * unit as i32, y), index, color, false, unit));
+            chart.draw_series(points.into_iter().map(|at| mark_at(at, index, false, unit)))?;
+            key.push((plain(name), index, false));
         }
-        legend(&mut chart, SeriesLabelPosition::UpperLeft, unit)
+        draw_key(&beside, key, unit)
     }
 }
 
@@ -202,6 +227,35 @@ impl Picture for Drawing<'_> {
     }
 }
 
+/// A name without the marks of code that it has in tables.
+fn plain(name: &str) -> String {
+    name.replace('`', "")
+}
+
+/// A number without needless digits.
+#[allow(clippy::trivially_copy_pass_by_ref)] // As plotters asks for it.
+fn short(value: &f64) -> String {
+    format!("{}", (value * 1e6).round() / 1e6)
+}
+
+/// What marks mean, one below the other.
+fn draw_key<B: DrawingBackend>(
+    area: &DrawingArea<B, Shift>,
+    key: Vec<(String, usize, bool)>,
+    unit: u32,
+) -> Drawn
+where
+    B::ErrorType: 'static,
+{
+    let style = TextStyle::from(font(LETTERS, unit).into_font()).pos(Pos::new(HPos::Left, VPos::Center));
+    for (line, (name, index, of_paper)) in key.into_iter().enumerate() {
+        let (x, y) = (8 * unit as i32, (52 + 20 * line as i32) * unit as i32);
+        area.draw(&mark_at((x, y), index, of_paper, unit))?;
+        area.draw(&Text::new(name, (x + 14 * unit as i32, y), style.clone()))?;
+    }
+    Ok(())
+}
+
 fn deviation(mark: &Mark) -> f64 {
     mark.value.deviation.unwrap_or(0.0)
 }
@@ -211,13 +265,17 @@ fn deviation(mark: &Mark) -> f64 {
 struct Symbol<C> {
     at: C,
     index: usize,
-    color: RGBColor,
     hollow: bool,
     unit: u32,
 }
 
-fn mark_at<C>(at: C, index: usize, color: RGBColor, hollow: bool, unit: u32) -> Symbol<C> {
-    Symbol { at, index, color, hollow, unit }
+fn mark_at<C>(at: C, index: usize, hollow: bool, unit: u32) -> Symbol<C> {
+    Symbol { at, index, hollow, unit }
+}
+
+/// The colour of a setting or a method, by its index.
+fn color(index: usize) -> RGBColor {
+    COLORS[index % COLORS.len()]
 }
 
 impl<'a, C: 'a> PointCollection<'a, C> for &'a Symbol<C> {
@@ -237,7 +295,7 @@ impl<C, B: DrawingBackend> Drawable<B> for Symbol<C> {
         _: (u32, u32),
     ) -> std::result::Result<(), DrawingErrorKind<B::ErrorType>> {
         let r = 5 * self.unit as i32;
-        let style = self.color.stroke_width(self.unit);
+        let style = color(self.index).stroke_width(self.unit);
         for (x, y) in points {
             let corners: &[[i32; 2]] = match self.index % 4 {
                 0 => {

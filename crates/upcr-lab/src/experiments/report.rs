@@ -129,6 +129,9 @@ fn section(outcome: &Outcome) -> String {
     text
 }
 
+/// A row of a table: its name, and its cells.
+type Line = (String, Vec<String>);
+
 /// A table for each setting; where settings are steps of one thing, a table for each measure.
 fn tables(outcome: &Outcome, steps: bool) -> Vec<String> {
     let Experiment { settings, methods, columns, .. } = &outcome.experiment;
@@ -138,8 +141,9 @@ fn tables(outcome: &Outcome, steps: bool) -> Vec<String> {
             let cells = |method: &str| -> Vec<String> {
                 settings.iter().map(|setting| cell(outcome, &setting.name, method, measure)).collect()
             };
-            let rows = methods.iter().map(|method| (method.name.clone(), cells(&method.name))).collect();
-            grid(heading(measure), &heads, rows)
+            let rows: Vec<Line> =
+                methods.iter().map(|method| (method.name.clone(), cells(&method.name))).collect();
+            grid(heading(measure), &heads, &rows)
         };
         return columns.iter().map(table).collect();
     }
@@ -152,7 +156,7 @@ fn tables(outcome: &Outcome, steps: bool) -> Vec<String> {
         let heads = columns.iter().map(|measure| heading(measure).to_owned());
         let heads: Vec<String> =
             heads.chain(papers.iter().map(|measure| format!("paper: {}", heading(measure)))).collect();
-        let rows = methods
+        let rows: Vec<Line> = methods
             .iter()
             .filter(|method| method.is_tested_in(setting))
             .map(|method| {
@@ -164,7 +168,7 @@ fn tables(outcome: &Outcome, steps: bool) -> Vec<String> {
                 (method.name.clone(), ours.chain(theirs).collect())
             })
             .collect();
-        tables.push(grid(&setting.name, &heads, rows));
+        tables.push(grid(&setting.name, &heads, &rows));
     }
     tables
 }
@@ -184,14 +188,16 @@ fn cell(outcome: &Outcome, setting: &str, method: &str, measure: &str) -> String
     }
 }
 
-fn grid(corner: &str, heads: &[String], rows: Vec<(String, Vec<String>)>) -> String {
+fn grid(corner: &str, heads: &[String], rows: &[Line]) -> String {
     let line = |first: &str, cells: &[String]| {
         let cells = cells.iter().map(|cell| cell.replace('|', "\\|"));
         format!("| {} | {} |\n", first.replace('|', "\\|"), cells.collect::<Vec<_>>().join(" | "))
     };
     let mut text = line(corner, heads);
     let _ = writeln!(text, "| --- |{}", " ---: |".repeat(heads.len()));
-    rows.iter().for_each(|(name, cells)| text.push_str(&line(name, cells)));
+    for (name, cells) in rows {
+        text.push_str(&line(name, cells));
+    }
     text
 }
 
@@ -201,30 +207,27 @@ fn lessons(learned: &[Lesson], points: usize) -> String {
         return String::new();
     }
     let heads = ["network", "learned from", "clouds", "steps", "s", "MAE(R) °", "recall"].map(str::to_owned);
-    let rows =
+    let rows: Vec<Line> =
         learned.iter().map(|lesson| (format!("`{}`", lesson.weights), row_of(lesson, points))).collect();
     format!(
         "## What has learned\n\nTimes are those of steps, validation excluded; errors those on held-out clouds or, where \
          a network learned on, on its own.\n\n{}",
-        grid("weights", &heads, rows)
+        grid("weights", &heads, &rows)
     )
 }
 
 fn row_of(lesson: &Lesson, points: usize) -> Vec<String> {
     let Weights { data, part, overlaps, adaptation, .. } = &lesson.of;
-    let learned_from = match adaptation {
-        Some(Adaptation { data, adapt, setting, .. }) => {
-            let clouds = if *adapt == Adapt::Tested { "tested pairs" } else { "training split" };
-            format!("{data}, {clouds}, {}, going on", setting.protocol(points))
-        }
-        None => {
-            let clouds = match part {
-                Part::UnseenClouds => "training split",
-                Part::UnseenCategories => "first half of the categories",
-            };
-            let overlaps: Vec<&str> = overlaps.iter().map(|&overlap| overlap_name(overlap)).collect();
-            format!("{data}, {clouds}, {}", overlaps.join(" and "))
-        }
+    let learned_from = if let Some(Adaptation { data, adapt, setting, .. }) = adaptation {
+        let clouds = if *adapt == Adapt::Tested { "tested pairs" } else { "training split" };
+        format!("{data}, {clouds}, {}, going on", setting.protocol(points))
+    } else {
+        let clouds = match part {
+            Part::UnseenClouds => "training split",
+            Part::UnseenCategories => "first half of the categories",
+        };
+        let overlaps: Vec<&str> = overlaps.iter().map(|&overlap| overlap_name(overlap)).collect();
+        format!("{data}, {clouds}, {}", overlaps.join(" and "))
     };
     let found = |value: fn(&ValidationErrors) -> f64| {
         lesson.held_out.as_ref().map_or(String::new(), |errors| format!("{:.3}", value(errors)))

@@ -154,12 +154,10 @@ impl PointNetLk {
 
     /// As many features as a pose takes: the target's, those of its twists, and the source's at every step.
     pub(super) fn features(&self, source_points: &Tensor<3>, target_points: &Tensor<3>) {
-        for _ in 0..1 + 6 {
-            drop(self.feature_model.forward(target_points, Statistics::Running, &mut Vec::new()));
-        }
-        for _ in 0..self.config.steps {
-            drop(self.feature_model.forward(source_points, Statistics::Running, &mut Vec::new()));
-        }
+        let feature = |points| drop(self.feature_model.forward(points, Statistics::Running, &mut Vec::new()));
+        feature(target_points);
+        (0..6).for_each(|_| feature(target_points));
+        (0..self.config.steps).for_each(|_| feature(source_points));
     }
 
     /// Changes of the target's feature by its twists, `[pairs, channels, 6]`.

@@ -73,38 +73,35 @@ impl Shape {
     }
 }
 
-/// What each query finds, `[batch, queries, values]`, and the logarithm of its sum of exponentials by head, `[batch,
-/// heads, queries]`.
+/// What each query finds, `[batch, queries, values]`, and the logarithm of its sum of exponentials by head: those of a
+/// block of queries one head after the other.
 pub fn forward(inputs: Inputs, shape: &Shape) -> (Vec<f32>, Vec<f32>) {
     let mut out = vec![0.0; shape.batch * shape.queries * shape.values];
     let mut logarithms = vec![0.0; shape.batch * shape.heads * shape.queries];
     let [_, width] = shape.widths();
+    let attend = |inputs: Inputs, block: usize, out: &mut [f32], logarithms: &mut [f32]| {
+        let rows = out.len() / shape.values;
+        let mut shares = Buffer::new(rows * shape.keys);
+        for (head, logarithms) in logarithms.chunks_exact_mut(rows).enumerate() {
+            shape.likenesses(inputs, head, (block * BLOCK, rows), &mut shares);
+            softmax(&mut shares, shape.scale, logarithms);
+            let values = Matrix::rows(&inputs[2][head * width..], shape.values);
+            let sizes = [rows, shape.keys, width];
+            let shares = Matrix::rows(&shares, shape.keys);
+            product_with_stride(sizes, shares, values, &mut out[head * width..], shape.values, false);
+        }
+    };
     out.par_chunks_mut(shape.queries * shape.values)
         .zip(logarithms.par_chunks_mut(shape.heads * shape.queries))
         .enumerate()
         .with_max_len(1)
         .for_each(|(batch, (out, logarithms))| {
             let inputs = shape.part(inputs, batch);
-            let mut shares = Buffer::new(BLOCK.min(shape.queries) * shape.keys);
-            for head in 0..shape.heads {
-                let values = Matrix::rows(&inputs[2][head * width..], shape.values);
-                for (first, rows) in shape.blocks() {
-                    let shares = &mut shares[..rows * shape.keys];
-                    shape.likenesses(inputs, head, (first, rows), shares);
-                    let logarithms = &mut logarithms[head * shape.queries + first..][..rows];
-                    softmax(shares, shape.scale, logarithms);
-                    let out = &mut out[first * shape.values + head * width..];
-                    let sizes = [rows, shape.keys, width];
-                    product_with_stride(
-                        sizes,
-                        Matrix::rows(shares, shape.keys),
-                        values,
-                        out,
-                        shape.values,
-                        false,
-                    );
-                }
-            }
+            out.par_chunks_mut(BLOCK * shape.values)
+                .zip(logarithms.par_chunks_mut(BLOCK * shape.heads))
+                .enumerate()
+                .with_max_len(1)
+                .for_each(|(block, (out, logarithms))| attend(inputs, block, out, logarithms));
         });
     (out, logarithms)
 }
@@ -145,7 +142,7 @@ pub fn backward(
                     let grad_out = Matrix::rows(&grad_out[row..], shape.values);
                     let values = Matrix::rows(&values[value_at..], shape.values).transposed();
                     product([rows, value_width, shape.keys], grad_out, values, grads, false);
-                    let logarithms = &logarithms[head * shape.queries + first..][..rows];
+                    let logarithms = &logarithms[first * shape.heads + head * rows..][..rows];
                     let found = Found { out: &out[row..], grad_out: grad_out.values, stride: shape.values };
                     through_softmax(shares, grads, shape.scale, logarithms, &found, value_width);
                     let (shares, grads) = (Matrix::rows(shares, shape.keys), Matrix::rows(grads, shape.keys));

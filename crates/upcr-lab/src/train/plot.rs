@@ -8,7 +8,7 @@ use plotters::prelude::*;
 use upcr::Result;
 
 use super::history::Event;
-use crate::drawing::{self, CAPTION, COLORS, Drawn, LETTERS, Picture, font, legend};
+use crate::drawing::{self, CAPTION, COLORS, Drawn, LETTERS, Picture, font};
 use crate::files::write_atomically;
 
 const SIZE: (u32, u32) = (960, 420);
@@ -97,7 +97,13 @@ where
                 PathElement::new([(x, y), (x + 18 * unit as i32, y)], color.stroke_width(2 * unit))
             });
     }
-    legend(&mut chart, SeriesLabelPosition::MiddleRight, unit)
+    chart
+        .configure_series_labels()
+        .label_font(font(LETTERS, unit))
+        .background_style(WHITE.mix(0.85))
+        .border_style(BLACK.mix(0.3))
+        .draw()?;
+    Ok(())
 }
 
 /// Writes the curve into a run's folder: `history.csv`, and `history.svg` as a picture.
