@@ -67,7 +67,9 @@ fn reproduce(args: &Args) -> Result<ExitCode> {
     }
     let mut seen = BTreeSet::new();
     if let Some((name, _)) = chosen.iter().find(|(name, _)| !seen.insert(name)) {
-        bail!("{name} is named twice: its files would take each other's place");
+        bail!(
+            "{name} is named twice, and its files would take each other's place: rename one, or leave one out"
+        );
     }
     let data = args.data.clone().unwrap_or_else(|| {
         std::env::var_os("UPCR_DATA").filter(|v| !v.is_empty()).map_or_else(|| "data".into(), PathBuf::from)
@@ -94,6 +96,9 @@ fn reproduce(args: &Args) -> Result<ExitCode> {
             output::note(&format!("skipped {}: none of its data sets is there ({names})", outcome.name));
         }
         write_outcome(&args.out, outcome)?;
+    }
+    if results.finished && results.experiments.iter().all(|outcome| outcome.data.is_none()) {
+        bail!("{}: nothing was done, for want of data", reproduction.data.display());
     }
     if !results.finished {
         output::note("stopped; the same command goes on");

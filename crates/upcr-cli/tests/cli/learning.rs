@@ -380,6 +380,7 @@ fn what_cannot_be_reproduced_is_told() {
     let run = upcr(["reproduce", "consistent", "--data", &scratch.path("nowhere"), "--out", &out]);
     assert!(run.status == 1 && run.stderr.contains("nowhere"), "{}", run.stderr);
     let run = upcr(["reproduce", "consistent", "--data", &data, "--out", &out]);
-    assert!(run.status == 0 && run.stderr.contains("skipped consistent"), "{}", run.stderr);
-    assert!(std::fs::read_to_string(run.stdout.trim()).unwrap().contains("Not done"));
+    assert!(run.status == 1 && run.stderr.contains("skipped consistent"), "{}", run.stderr);
+    let report = std::fs::read_to_string(Path::new(&out).join("report.md")).unwrap();
+    assert!(report.contains("Not done"), "{report}");
 }

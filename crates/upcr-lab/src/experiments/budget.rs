@@ -83,15 +83,17 @@ impl Budget {
     pub fn check(&self) -> Result<()> {
         // So that three quarters of the points are a whole number of them, in learning as in tests.
         if self.points == 0 || !self.points.is_multiple_of(4) {
-            return Err(refused("a budget's points must be a multiple of 4".into()));
+            return Err(refused("a budget's points must be 4 or a multiple of it".into()));
         }
         if self.pairs == Some(0) {
             return Err(refused("a budget must have a pair to test on at least".into()));
         }
         let learning = self.training.values().chain([&self.adaptation]);
-        for Learning { learning_rate, batch, .. } in learning {
-            if batch.unwrap_or(self.batch) == 0 || !(*learning_rate > 0.0 && learning_rate.is_finite()) {
-                return Err(refused("batches and step sizes must be positive".into()));
+        for Learning { length, learning_rate, batch } in learning {
+            let positive = *learning_rate > 0.0 && learning_rate.is_finite();
+            let nothing = matches!(length, Length::Steps(0) | Length::Epochs(0));
+            if batch.unwrap_or(self.batch) == 0 || !positive || nothing {
+                return Err(refused("lengths, batches and step sizes must be positive".into()));
             }
         }
         Ok(())

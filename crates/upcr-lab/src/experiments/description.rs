@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::{Deserialize, Serialize};
 use upcr::{Error, Result};
 
-use super::report::is_measure;
+use super::report::measures;
 use crate::data::pairs::{Coverage, MotionLaw, Protocol};
 use crate::eval::methods::EvaluatedMethod;
 use crate::models::LearnedConfig;
@@ -19,7 +19,8 @@ pub type Values = BTreeMap<String, f64>;
 pub struct Experiment {
     /// What it shows.
     pub title: String,
-    /// Where the paper has it.
+    /// Where the paper has it; nowhere where nothing is told.
+    #[serde(default)]
     pub paper: String,
     /// What a reader should know of it.
     #[serde(default)]
@@ -201,8 +202,14 @@ impl Experiment {
         distinct("setting", names.iter().copied())?;
         distinct("method", methods.iter().map(|method| method.name.as_str()))?;
         let plotted = self.plot.iter().map(|plot| &plot.measure);
-        if let Some(unknown) = columns.iter().chain(plotted).find(|name| !is_measure(name)) {
-            return Err(refused(format!("there is no measure {unknown}")));
+        let known: Vec<&str> = measures(self.measure).collect();
+        if let Some(unknown) = columns.iter().chain(plotted).find(|name| !known.contains(&name.as_str())) {
+            return Err(refused(format!("{unknown} is not measured; these are: {}", known.join(", "))));
+        }
+        if self.plot.as_ref().is_some_and(|plot| plot.kind == PlotKind::Lines)
+            && !settings.windows(2).all(|pair| pair[0].outliers < pair[1].outliers)
+        {
+            return Err(refused("lines are drawn over settings with more and more outliers".into()));
         }
         if let Some(setting) = settings.iter().find(|setting| !(0.0..=1.0).contains(&setting.outliers)) {
             return Err(refused(format!("{}: outliers must be a share, 0 to 1", setting.name)));

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use upcr::{Error, Result};
 
 use super::budget::Budget;
-use super::description::{Adapt, Experiment, Measure, Method, Part, Setting};
+use super::description::{Adapt, Experiment, Measure, Method, Part, Setting, refused};
 use crate::data::pairs::Coverage;
 use crate::models::LearnedConfig;
 use crate::random;
@@ -138,7 +138,9 @@ impl Experiment {
                 for seed in 0..seeds {
                     let weights = match (&method.network, &learn_from) {
                         (Some(network), Some(learn_from)) => {
-                            Some(self.weights(method, network, setting, budget, [&data, learn_from], seed)?)
+                            let weights =
+                                self.weights(method, network, setting, budget, [&data, learn_from], seed);
+                            Some(weights.map_err(|e| refused(format!("{}: {e}", method.name)))?)
                         }
                         (Some(_), None) => continue,
                         (None, _) => None,

@@ -39,9 +39,10 @@ pub(super) fn heading(measure: &str) -> &str {
     COLUMNS.iter().find(|column| column.name == measure).map_or(measure, |column| column.heading)
 }
 
-/// Whether it is one.
-pub(super) fn is_measure(name: &str) -> bool {
-    COLUMNS.iter().any(|column| column.name == name)
+/// The measures that an experiment may ask for.
+pub(super) fn measures(of: Measure) -> impl Iterator<Item = &'static str> {
+    let names = COLUMNS.iter().map(|column| column.name);
+    names.filter(move |name| name.ends_with("_ms") == (of == Measure::Time))
 }
 
 fn digits(measure: &str) -> usize {
@@ -82,6 +83,9 @@ pub fn markdown(results: &Results, command: &str) -> String {
         "`{command}`, upcr {}, {} threads. Budget `{}`:\n\n```toml\n{}```\n",
         results.version, results.threads, results.budget_name, budget
     );
+    if !results.finished {
+        text.push_str("**Not finished**: what is missing below has not been measured yet.\n\n");
+    }
     for outcome in &results.experiments {
         text.push_str(&section(outcome));
     }
@@ -92,7 +96,8 @@ pub fn markdown(results: &Results, command: &str) -> String {
 /// An experiment's heading, picture and tables.
 fn section(outcome: &Outcome) -> String {
     let Experiment { title, paper, note, .. } = &outcome.experiment;
-    let mut text = format!("## {title}\n\nThe paper's {paper}; `upcr reproduce {}`.", outcome.name);
+    let paper = if paper.is_empty() { String::new() } else { format!("The paper's {paper}; ") };
+    let mut text = format!("## {title}\n\n{paper}`upcr reproduce {}`.", outcome.name);
     let Some(data) = &outcome.data else {
         let names = outcome.experiment.data.join(", ");
         let _ = writeln!(text, " Not done: none of the data sets is there ({names}).\n");

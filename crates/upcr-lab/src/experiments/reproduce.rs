@@ -130,8 +130,8 @@ pub struct Reproduction {
 }
 
 impl Reproduction {
-    /// Does what has not been done of the experiments, by name. Where it was stopped, the results are those of the
-    /// experiments that were finished, and not all of them. A network that fails to learn leaves its cells empty.
+    /// Does what has not been done of the experiments, by name. Where it was stopped, the results are what had been measured
+    /// until then. A network that fails to learn leaves its cells empty.
     ///
     /// # Errors
     /// Where an experiment cannot be planned, data cannot be read, the folder cannot be written to or holds what was made
@@ -151,7 +151,8 @@ impl Reproduction {
         let mut store = Store { run: self, shapes: BTreeMap::new() };
         let mut learned = BTreeMap::new();
         let mut outcomes = Vec::new();
-        'experiments: for ((name, experiment), plan) in experiments.iter().zip(plans) {
+        let mut finished = true;
+        for ((name, experiment), plan) in experiments.iter().zip(plans) {
             let data = plan.as_ref().and_then(|cells| cells.first()).map(|cell| cell.test.data.clone());
             let mut learners = plan.iter().flatten().filter_map(|cell| cell.test.weights.as_ref());
             let learned_from = learners.next().map(|weights| weights.data.clone());
@@ -159,11 +160,15 @@ impl Reproduction {
             for Cell { setting, method, seed, test } in plan.into_iter().flatten() {
                 let mut told = Told { tasks: &mut tasks, spectator: &mut *spectator, experiment: name };
                 if let Some(weights) = test.weights.as_ref().filter(|_| test.measure == Measure::Errors) {
-                    let Some(lessons) = store.learn(weights, &mut told)? else { break 'experiments };
+                    let Some(lessons) = store.learn(weights, &mut told)? else {
+                        finished = false;
+                        break;
+                    };
                     learned.extend(lessons.into_iter().map(|lesson| (lesson.weights.clone(), lesson)));
                 }
                 if told.spectator.stop() {
-                    break 'experiments;
+                    finished = false;
+                    break;
                 }
                 let failed = |weights: &Weights| learned.get(&weights.id()).is_some_and(Lesson::has_failed);
                 let values = if test.weights.as_ref().is_some_and(failed) {
@@ -176,13 +181,16 @@ impl Reproduction {
             }
             let experiment = experiment.clone();
             outcomes.push(Outcome { name: name.clone(), experiment, data, learned_from, cells });
+            if !finished {
+                break;
+            }
         }
         Ok(Results {
             version: env!("CARGO_PKG_VERSION").into(),
             budget_name: self.budget_name.clone(),
             budget: self.budget.clone(),
             threads: rayon::current_num_threads(),
-            finished: outcomes.len() == experiments.len(),
+            finished,
             experiments: outcomes,
             learned: learned.into_values().collect(),
         })
@@ -201,8 +209,16 @@ impl Reproduction {
             None => write_json(&path, &made),
             Some(before) if before == made => Ok(()),
             Some(before) => {
+                let fields = [
+                    ("version", before.version == made.version, before.version),
+                    ("data", before.data == made.data, before.data.display().to_string()),
+                    ("device", before.device == made.device, before.device),
+                    ("threads", before.threads == made.threads, before.threads.to_string()),
+                ];
+                let other = fields.into_iter().filter(|(_, same, _)| !same);
+                let other: Vec<String> = other.map(|(name, _, value)| format!("{name} {value}")).collect();
                 let reason =
-                    format!("holds what was made otherwise ({before:?}, now {made:?}); take another folder");
+                    format!("was made with {}; go on with that, or take another folder", other.join(", "));
                 Err(Error::Unsupported { path: self.folder.clone(), reason })
             }
         }
@@ -436,7 +452,11 @@ fn method_of(network: Learned, run: Option<&str>) -> Result<EvaluatedMethod> {
 /// How many of so many pairs are tested on.
 fn some_of(pairs: usize, test: &Test) -> Result<usize> {
     if pairs == 0 {
-        let reason = format!("{}: there are no pairs of {:?}", test.data, test.setting);
+        let pairs = match test.setting.frames_apart {
+            Some(gap) => format!("frames that are {gap} apart"),
+            None => "shapes".into(),
+        };
+        let reason = format!("{} has no {pairs} to test on", test.data);
         return Err(Error::InvalidSetting { name: "experiment", reason });
     }
     Ok(pairs.min(test.pairs.unwrap_or(usize::MAX)))
