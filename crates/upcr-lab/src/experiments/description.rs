@@ -260,6 +260,9 @@ impl Method {
         let learns_alone = self.network.as_deref().is_some_and(|network| network == "upcr");
         match (&self.run, &self.network) {
             (None, None) => return refused("has neither a network nor what to run"),
+            (Some(run), Some(_)) if run != "default" && !run.starts_with("upcr") => {
+                return refused("what it runs looks at no network");
+            }
             (Some(_), Some(_)) if !learns_alone => {
                 return refused("only UPCR's network is run by other methods");
             }

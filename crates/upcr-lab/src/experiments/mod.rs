@@ -211,6 +211,8 @@ mod tests {
             format!("colour = 3\n{whole}"),
             format!("{whole}adapt = \"tested\"\n"),
             format!("{whole}network = \"prnet\"\n"),
+            format!("{whole}network = \"upcr\"\n"),
+            format!("{}network = \"prnet\"\n", whole.replace("icp", "upcr")),
             format!("{whole}{method}"),
             format!("{start}{setting}{setting}{method}"),
             format!("{start}{setting}outliers = 1.5\n{method}"),

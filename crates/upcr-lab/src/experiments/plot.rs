@@ -1,5 +1,6 @@
 //! Results as pictures: a row of marks for each method, or a line over growing disturbance.
 
+use std::error::Error;
 use std::ops::Range;
 
 use plotters::coord::Shift;
@@ -19,6 +20,12 @@ pub fn picture(outcome: &Outcome) -> Option<impl Picture + '_> {
     let plot = outcome.experiment.plot.as_ref()?;
     Some(Drawing::new(outcome, plot)).filter(|drawing| drawing.range().1 > 0.0)
 }
+
+/// What a mark stands for: a name, the mark's index, and whether it is hollow.
+type Entry = (String, usize, bool);
+
+/// What drawing marks ends with: what they stand for.
+type WithKey = Result<Vec<Entry>, Box<dyn Error>>;
 
 /// A measured value, or one of the paper's.
 struct Mark {
@@ -87,7 +94,7 @@ impl<'a> Drawing<'a> {
     }
 
     /// Over a logarithmic axis, where values differ tenfold.
-    fn dots<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
+    fn dots<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> WithKey
     where
         B::ErrorType: 'static,
     {
@@ -107,16 +114,15 @@ impl<'a> Drawing<'a> {
         unit: u32,
         axis: X,
         Range { start, end }: Range<f64>,
-    ) -> Drawn
+    ) -> WithKey
     where
         B::ErrorType: 'static,
         X::CoordDescType: ValueFormatter<f64>,
     {
         let count = self.methods.len();
         let letters = font(LETTERS, unit);
-        let (area, beside) = area.split_horizontally((WIDTH - KEY) * unit);
         let mut key = Vec::new();
-        let mut chart = ChartBuilder::on(&area)
+        let mut chart = ChartBuilder::on(area)
             .caption(&self.outcome.experiment.title, font(CAPTION, unit))
             .margin(12 * unit)
             .x_label_area_size(40 * unit)
@@ -167,19 +173,18 @@ impl<'a> Drawing<'a> {
                 }
             }
         }
-        draw_key(&beside, key, unit)
+        Ok(key)
     }
 
-    fn lines<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
+    fn lines<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> WithKey
     where
         B::ErrorType: 'static,
     {
         let (_, high) = self.range();
         let last = self.settings.iter().map(|(_, x)| *x).fold(0.01, f64::max);
         let letters = font(LETTERS, unit);
-        let (area, beside) = area.split_horizontally((WIDTH - KEY) * unit);
         let mut key = Vec::new();
-        let mut chart = ChartBuilder::on(&area)
+        let mut chart = ChartBuilder::on(area)
             .caption(&self.outcome.experiment.title, font(CAPTION, unit))
             .margin(12 * unit)
             .x_label_area_size(40 * unit)
@@ -204,7 +209,7 @@ impl<'a> Drawing<'a> {
             chart.draw_series(points.into_iter().map(|at| mark_at(at, index, false, unit)))?;
             key.push((plain(name), index, false));
         }
-        draw_key(&beside, key, unit)
+        Ok(key)
     }
 }
 
@@ -220,10 +225,12 @@ impl Picture for Drawing<'_> {
     where
         B::ErrorType: 'static,
     {
-        match self.plot.kind {
-            PlotKind::Dots => self.dots(area, unit),
-            PlotKind::Lines => self.lines(area, unit),
-        }
+        let (area, beside) = area.split_horizontally((WIDTH - KEY) * unit);
+        let key = match self.plot.kind {
+            PlotKind::Dots => self.dots(&area, unit)?,
+            PlotKind::Lines => self.lines(&area, unit)?,
+        };
+        draw_key(&beside, key, unit)
     }
 }
 
@@ -239,11 +246,7 @@ fn short(value: &f64) -> String {
 }
 
 /// What marks mean, one below the other.
-fn draw_key<B: DrawingBackend>(
-    area: &DrawingArea<B, Shift>,
-    key: Vec<(String, usize, bool)>,
-    unit: u32,
-) -> Drawn
+fn draw_key<B: DrawingBackend>(area: &DrawingArea<B, Shift>, key: Vec<Entry>, unit: u32) -> Drawn
 where
     B::ErrorType: 'static,
 {

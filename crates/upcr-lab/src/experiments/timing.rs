@@ -38,17 +38,19 @@ pub(super) fn times(test: &Test) -> Result<Values> {
                 "icp+pfh" => Some(MatchedFeature::Pfh),
                 _ => None,
             };
-            let features = match feature {
-                Some(feature) => median(&pairs, |pair| {
+            let mut solve = total;
+            if let Some(feature) = feature {
+                let features = median(&pairs, |pair| {
                     let described = |cloud: &PointCloud| {
                         describe(cloud, feature.feature(), Support::Nearest(DEFAULT_K), None)
                     };
                     let (a, b) = join(|| described(&pair.source), || described(&pair.target));
                     Ok((a?, b?))
-                })?,
-                None => 0.0,
-            };
-            parts.extend([("features_ms", features), ("solve_ms", total - features), ("total_ms", total)]);
+                })?;
+                solve -= features;
+                parts.push(("features_ms", features));
+            }
+            parts.extend([("solve_ms", solve), ("total_ms", total)]);
         }
         Some(weights) => {
             let network = weights.training.network.init(0, &Device::flex())?;
