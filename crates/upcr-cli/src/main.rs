@@ -2,6 +2,8 @@
 
 #[cfg(feature = "train")]
 mod adapt;
+#[cfg(feature = "train")]
+mod calibrate;
 mod convert;
 mod eval;
 mod features;
@@ -65,6 +67,8 @@ enum Command {
     Train(train::Args),
     #[cfg(feature = "train")]
     Adapt(adapt::Args),
+    #[cfg(feature = "train")]
+    Calibrate(calibrate::Args),
     Eval(eval::Args),
     #[cfg(feature = "train")]
     Reproduce(reproduce::Args),
@@ -83,6 +87,8 @@ fn main() -> ExitCode {
         Command::Train(args) => train::run(&args),
         #[cfg(feature = "train")]
         Command::Adapt(args) => adapt::run(&args),
+        #[cfg(feature = "train")]
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Eval(args) => eval::run(&args),
         #[cfg(feature = "train")]
         Command::Reproduce(args) => reproduce::run(&args),

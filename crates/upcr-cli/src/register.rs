@@ -13,7 +13,7 @@ use clap::ValueEnum;
 use serde::Serialize;
 use upcr::features::MatchedFeature;
 use upcr::net::Network;
-use upcr::{Locks, Method, Refinement, Registration, RobustKernel, Settings, io};
+use upcr::{Calibration, Locks, Method, Refinement, Registration, RobustKernel, Settings, io};
 
 use crate::output::{self, Progress};
 use crate::{NOT_REGISTERED, describe, input};
@@ -58,6 +58,9 @@ pub struct Args {
     /// Degrees of freedom that keep their value in the first guess, e.g. `roll,pitch,z`
     #[arg(long, value_name = "AXES", value_enum, value_delimiter = ',')]
     lock: Vec<Axis>,
+    /// What the evidence for a pose weighs: a file that `upcr calibrate` wrote [default: the calibration in the program]
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
     /// Seed of every random choice
     #[arg(long, default_value_t = Settings::default().seed)]
     seed: u64,
@@ -111,6 +114,7 @@ impl Args {
             kernel: self.kernel,
             overlap: self.overlap,
             locks,
+            calibration: self.calibration.as_deref().map(Calibration::load).transpose()?.map(Arc::new),
             seed: self.seed,
             threads: self.threads,
         })
@@ -253,6 +257,24 @@ fn summary(found: &Registration, args: &Args, source: &Path, target: &Path) -> S
     };
     for reason in &found.reasons {
         let _ = writeln!(text, "caveat       {reason}");
+    }
+    if let Some(scale) = found.source_scale {
+        let _ =
+            writeln!(text, "             they fit once the source's lengths are multiplied by {scale:.6}");
+    }
+    for (rank, other) in found.alternatives.iter().enumerate() {
+        let T = &other.T_target_source;
+        let turned = (T.inverse() * *pose).angle().to_degrees();
+        let t = T.translation;
+        let _ = writeln!(
+            text,
+            "alternative  {}: turned by {turned:.2}°, translation ({:.6}, {:.6}, {:.6}), score {:.3} of the best",
+            rank + 1,
+            t[0],
+            t[1],
+            t[2],
+            other.relative_score
+        );
     }
     let _ = writeln!(
         text,

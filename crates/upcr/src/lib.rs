@@ -20,9 +20,10 @@ pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
 pub use refine::{Locks, Refinement, RobustKernel};
 pub use register::register;
-pub use registration::{Reason, Registration, TRUSTWORTHY, Timings};
+pub use registration::{Alternative, Reason, Registration, TRUSTWORTHY, Timings};
 pub use settings::{Method, Settings};
 pub use transform::Rigid;
+pub use verify::{Calibration, Evidence, FEATURES};
 
 #[cfg(doctest)]
 #[doc = include_str!("../../../README.md")]

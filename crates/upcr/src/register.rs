@@ -1,5 +1,6 @@
 //! The one pipeline: prepare, hypotheses, refine, verify.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use nalgebra::Matrix6;
@@ -9,21 +10,28 @@ use crate::{
     CloudRole, Error, PointCloud, Result,
     cloud::orient_by_curvature,
     features::{Descriptors, Feature, FeatureInput},
-    hypothesis::{Hypothesis, Match, Problem, SOURCES, are_alike, match_levels, separation},
+    hypothesis::{Hypothesis, Match, Problem, SOURCES, are_alike, match_levels, separation, turned},
     prepare::{Described, Level, Prepared, check, derive_voxel_size, prepare},
-    refine::{Icp, LockedPose, Refined, Refinement, Schedule, factor},
-    registration::{Registration, Timings},
+    refine::{Icp, LockedPose, Locks, Refined, Refinement, Schedule, factor},
+    registration::{Alternative, Reason, Registration, Timings},
     settings::{Method, Settings},
     threads::on_threads,
     transform::Rigid,
-    verify::{Evidence, conditioning, covariance, distances, judge, overlap_at},
+    verify::{
+        Calibration, Evidence, Sizes, conditioning, covariance, judge, meeting, overlap_at, scaled, seen,
+    },
 };
 
 /// Hypotheses that are refined on the coarse level, and of those on the fine one.
 const COARSE_CANDIDATES: usize = 8;
 const FINE_CANDIDATES: usize = 3;
+/// Different poses that score at least this share of the best are as good an answer; so many of them are told.
+const RIVALLING: f64 = 0.95;
+const RIVALS: usize = 8;
 /// A hypothesis that scores less than this share of the best is not looked at further.
 const PROMISING: f64 = 0.7;
+/// As much for turns of the best, which show what else the clouds would let pass.
+const TELLING: f64 = 0.5;
 /// Where points lie on each other as closely as this, no other pose can look as right.
 const COINCIDENT: f64 = 0.95;
 /// Points that score an alternative at a glance and a raw hypothesis, that refine it coarsely, that score it then, and
@@ -58,10 +66,33 @@ struct Candidate {
     method: Method,
     refined: Refined,
     score: f64,
-    sharpness: f64,
+    closeness: f64,
+    /// Share of the hypotheses, coarsely refined, that came here.
+    agreement: f64,
+    /// Score of the best clearly different pose over that of this one, both coarsely refined.
+    glimpsed: f64,
 }
 
 fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
+    let start = Instant::now();
+    let mut found = run_as_is(source, target, settings)?;
+    if !found.is_trustworthy() {
+        let sizes = Sizes::of(source, target);
+        let plain = Settings { init: None, locks: Locks::default(), voxel_size: None, ..settings.clone() };
+        found.source_scale = sizes.factors().into_iter().find(|&factor| {
+            let fits = run_as_is(&scaled(source, factor), target, &plain);
+            fits.is_ok_and(|fits| fits.is_trustworthy())
+        });
+        if found.source_scale.is_some() || sizes.are_far_apart() {
+            found.reasons.insert(0, Reason::ScaleMismatch);
+        }
+        found.timings_ms.total = milliseconds(start);
+    }
+    Ok(found)
+}
+
+/// The pose at the scale that the clouds have.
+fn run_as_is(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
     let start = Instant::now();
     let (source, target) =
         rayon::join(|| check(source, CloudRole::Source), || check(target, CloudRole::Target));
@@ -79,7 +110,7 @@ fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<
     let (source, target) =
         rayon::join(|| prepare(&source, voxel_size, described), || prepare(&target, voxel_size, described));
     let (source, target) = (source?, target?);
-    let mut pipeline = Pipeline::new(&source, &target, voxel_size, asks_network, settings);
+    let mut pipeline = Pipeline::new(&source, &target, voxel_size, asks_network, settings)?;
     pipeline.timings.prepare = milliseconds(start);
     let mut best = pipeline.best()?;
     best.timings_ms.total = milliseconds(start);
@@ -101,6 +132,7 @@ struct Pipeline<'a> {
     lock: Option<LockedPose>,
     matches: Vec<Match>,
     candidates: Vec<Candidate>,
+    calibration: Arc<Calibration>,
     timings: Timings,
 }
 
@@ -111,11 +143,11 @@ impl<'a> Pipeline<'a> {
         voxel_size: f64,
         asks_network: bool,
         settings: &'a Settings,
-    ) -> Self {
+    ) -> Result<Self> {
         let init = settings.init.unwrap_or_else(Rigid::identity);
         let lock = LockedPose::new(settings.locks, &init, source.origin, target.origin);
         let init = to_local(&init, source, target);
-        Self {
+        Ok(Self {
             source,
             target,
             settings,
@@ -125,8 +157,9 @@ impl<'a> Pipeline<'a> {
             lock,
             matches: Vec::new(),
             candidates: Vec::new(),
+            calibration: settings.calibration.clone().map_or_else(Calibration::embedded, Ok)?,
             timings: Timings::default(),
-        }
+        })
     }
 
     /// Asks one source of hypotheses after the other until the verdict is sure.
@@ -140,22 +173,20 @@ impl<'a> Pipeline<'a> {
             if source.needs_matches() && self.matches.is_empty() {
                 self.matches = self.feature_matches()?;
             }
-            let coarse = self.source.coarse().voxel_size.max(self.target.coarse().voxel_size);
             let problem = Problem {
                 source: self.source,
                 target: self.target,
                 matches: &self.matches,
                 init: self.init,
                 network: self.settings.network.as_deref(),
-                tolerance: TOLERANCE_VOXELS * coarse,
+                tolerance: self.match_tolerance(),
                 seed: self.settings.seed,
                 alone: self.settings.method == source.method(),
             };
             let hypotheses = source.propose(&problem);
             self.timings.hypotheses += milliseconds(start);
             let start = Instant::now();
-            let refined = self.refined(&hypotheses, |best| source.alternatives(&problem, best));
-            self.candidates.extend(refined);
+            self.candidates.extend(self.refined(&hypotheses));
             self.candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
             self.timings.refine += milliseconds(start);
             let start = Instant::now();
@@ -192,6 +223,11 @@ impl<'a> Pipeline<'a> {
         Ok(match_levels((a, &da?), (b, &db?)))
     }
 
+    /// Distance between matched points under a right pose, at most.
+    fn match_tolerance(&self) -> f32 {
+        TOLERANCE_VOXELS * self.source.coarse().voxel_size.max(self.target.coarse().voxel_size)
+    }
+
     /// The refinement between two levels.
     fn icp(&self, source: &'a Level, target: &'a Level) -> Icp<'_> {
         Icp {
@@ -203,21 +239,19 @@ impl<'a> Pipeline<'a> {
         }
     }
 
-    /// Ranks hypotheses by overlap, refines the best coarsely, ranks again, beside the `alternatives` to the best, and
-    /// refines the best of those finely.
-    fn refined(
-        &self,
-        hypotheses: &[Hypothesis],
-        alternatives: impl FnOnce(&Rigid) -> Vec<Hypothesis>,
-    ) -> Vec<Candidate> {
+    /// Ranks hypotheses by overlap, refines the best coarsely, ranks again, beside turns of the best, and refines
+    /// the best of those finely.
+    fn refined(&self, hypotheses: &[Hypothesis]) -> Vec<Candidate> {
         let (source, target) = (self.source.coarse(), self.target.coarse());
         let limit = REACH_VOXELS * source.voxel_size.max(target.voxel_size);
         let rank = |pose: &Rigid, points: usize| overlap_at(source, target, pose, points, limit).score(2);
-        let promising = |hypotheses: &[Hypothesis], points: usize, least: f64| {
+        let promising = |hypotheses: &[Hypothesis], points: usize, share: f64, of: f64| {
             let mut ranked: Vec<(f64, Hypothesis)> =
                 hypotheses.par_iter().map(|h| (rank(&h.pose, points), *h)).collect();
+            ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+            let least = share * of.max(ranked.first().map_or(0.0, |best| best.0));
             ranked.retain(|&(score, _)| score >= least);
-            keep_promising(&mut ranked, COARSE_CANDIDATES);
+            ranked.truncate(COARSE_CANDIDATES);
             ranked
         };
         let moved = source.spread(COARSE_POINTS);
@@ -232,24 +266,41 @@ impl<'a> Pipeline<'a> {
             });
             refined.collect()
         };
-        let mut ranked = coarsely_refined(promising(hypotheses, RANKING_POINTS, 0.0));
+        let mut ranked = coarsely_refined(promising(hypotheses, RANKING_POINTS, PROMISING, 0.0));
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let proposed: Vec<Rigid> = ranked.iter().map(|(_, h)| h.pose).collect();
         if let Some((score, best)) = ranked.first()
             && *score < COINCIDENT
         {
-            let others = promising(&alternatives(&best.pose), GLANCING_POINTS, PROMISING * score);
+            let turns: Vec<Hypothesis> =
+                turned(source, &best.pose).into_iter().map(|pose| Hypothesis { pose, ..*best }).collect();
+            let others = promising(&turns, GLANCING_POINTS, TELLING, *score);
             ranked.extend(coarsely_refined(others));
             ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         }
         let radius = f64::from(self.source.fine.radius);
+        let same = |a: &Rigid, b: &Rigid| separation(a, b, radius) <= f64::from(limit);
         let mut distinct: Vec<(f64, Hypothesis)> = Vec::new();
         for (score, h) in ranked {
-            if distinct.iter().all(|(_, d)| separation(&d.pose, &h.pose, radius) > f64::from(limit)) {
+            if distinct.iter().all(|(_, d)| !same(&d.pose, &h.pose)) {
                 distinct.push((score, h));
             }
         }
-        keep_promising(&mut distinct, FINE_CANDIDATES);
-        distinct.iter().map(|(_, h)| self.finely_refined(h)).collect()
+        let best = distinct.first().map_or(0.0, |best| best.0);
+        let second = distinct.get(1).map_or(0.0, |second| second.0);
+        let fine = distinct.iter().enumerate().take_while(|(rank, (score, _))| {
+            let enough = if *rank < FINE_CANDIDATES { PROMISING } else { RIVALLING };
+            *rank < RIVALS && *score >= enough * best
+        });
+        fine.map(|(rank, (score, h))| {
+            let agreeing = proposed.iter().filter(|pose| same(pose, &h.pose)).count();
+            Candidate {
+                agreement: agreeing as f64 / proposed.len().max(1) as f64,
+                glimpsed: if rank == 0 { second } else { best } / score.max(f64::MIN_POSITIVE),
+                ..self.finely_refined(h)
+            }
+        })
+        .collect()
     }
 
     fn finely_refined(&self, hypothesis: &Hypothesis) -> Candidate {
@@ -283,9 +334,16 @@ impl<'a> Pipeline<'a> {
         };
         let overlap = overlap_at(source, target, &refined.pose, SCORING_POINTS, reach);
         let score = overlap.score(SCORING_SCALES);
-        let sharpness = score / overlap.score(1).max(f64::MIN_POSITIVE);
+        let closeness = score / overlap.score(1).max(f64::MIN_POSITIVE);
         // Walls that slide along each other overlap more than those that stand where they belong, but less closely.
-        Candidate { method: hypothesis.method, refined, score: score * sharpness, sharpness }
+        Candidate {
+            method: hypothesis.method,
+            refined,
+            score: score * closeness,
+            closeness,
+            agreement: 0.0,
+            glimpsed: 0.0,
+        }
     }
 
     /// The best candidate with the verdict on it.
@@ -293,44 +351,70 @@ impl<'a> Pipeline<'a> {
         let radius = f64::from(self.source.fine.radius);
         let Some(best) = self.candidates.first() else { return self.nothing_found() };
         let pose = &best.refined.pose;
-        let distinct = DISTINCT_VOXELS * self.voxel_size;
-        let runner_up = self
-            .candidates
-            .iter()
-            .find(|c| separation(&c.refined.pose, pose, radius) > distinct)
-            .map_or(0.0, |c| c.score / best.score.max(f64::MIN_POSITIVE));
+        let relative = |c: &Candidate| c.score / best.score.max(f64::MIN_POSITIVE);
+        let others = self.others(best);
         let (source, target) = (&self.source.fine, &self.target.fine);
         let limit = self.voxel_size as f32;
-        let forward = distances(source, &self.source.held_out_points(), target, pose, limit);
-        let backward = distances(target, &self.target.held_out_points(), source, &pose.inverse(), limit);
-        let conditioning = conditioning(&best.refined.shape_hessian, radius);
-        let inliers = forward.within(limit) + backward.within(limit);
+        let forward = meeting(source, &self.source.held_out_points(), target, pose, limit);
+        let backward = meeting(target, &self.target.held_out_points(), source, &pose.inverse(), limit);
+        let tolerance = self.match_tolerance();
+        let explained = |matches: &[Match]| matches.iter().filter(|m| m.agrees_with(pose, tolerance)).count();
         let evidence = Evidence {
-            overlap: [forward.share(limit), backward.share(limit)],
-            inliers,
-            sharpness: best.sharpness,
-            runner_up,
-            conditioning,
+            closeness: best.closeness,
+            runner_up: others.first().map_or(0.0, |c| relative(c)),
+            rivals: others.iter().filter(|c| relative(c) >= RIVALLING).count(),
+            glimpsed: best.glimpsed,
+            agreement: best.agreement,
+            matches: (!self.matches.is_empty()).then(|| [explained(&self.matches), self.matches.len()]),
+            conditioning: conditioning(&best.refined.shape_hessian, radius),
             converged: best.refined.converged || self.settings.refine == Refinement::None,
-            points: source.points.len().min(target.points.len()),
+            ..Evidence::none(source.points.len().min(target.points.len()))
         };
-        let verdict = judge(&evidence);
+        let evidence = seen([&forward, &backward], limit, evidence);
+        let verdict = judge(&evidence, &self.calibration);
         let covariance = covariance(&best.refined.hessian, best.refined.variance, radius);
         Registration {
-            T_target_source: match &self.lock {
-                Some(lock) => lock.file_pose(pose),
-                None => to_file(pose, self.source, self.target),
-            },
+            T_target_source: self.file_pose(pose),
             fitness: forward.share(limit),
             inlier_rmse: forward.rmse(limit),
-            num_inliers: forward.within(limit),
-            converged: evidence.converged && forward.within(limit) > 0,
+            num_inliers: forward.count(limit),
+            converged: evidence.converged && forward.count(limit) > 0,
             iterations: best.refined.iterations,
             probability: verdict.probability,
             covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
             reasons: verdict.reasons,
+            alternatives: (others.iter().filter(|c| relative(c) >= RIVALLING).take(RIVALS))
+                .map(|c| Alternative {
+                    T_target_source: self.file_pose(&c.refined.pose),
+                    relative_score: relative(c),
+                })
+                .collect(),
+            evidence,
             method: best.method,
             ..self.nothing_found()
+        }
+    }
+
+    /// Candidates that are clearly different from `best` and from each other, best first.
+    fn others(&self, best: &Candidate) -> Vec<&Candidate> {
+        let radius = f64::from(self.source.fine.radius);
+        let same = |a: &Candidate, b: &Candidate| {
+            separation(&a.refined.pose, &b.refined.pose, radius) <= DISTINCT_VOXELS * self.voxel_size
+        };
+        let mut others: Vec<&Candidate> = Vec::new();
+        for candidate in &self.candidates {
+            if !same(candidate, best) && others.iter().all(|other| !same(candidate, other)) {
+                others.push(candidate);
+            }
+        }
+        others
+    }
+
+    /// The pose between the clouds in their files' frames.
+    fn file_pose(&self, local: &Rigid) -> Rigid {
+        match &self.lock {
+            Some(lock) => lock.file_pose(local),
+            None => to_file(local, self.source, self.target),
         }
     }
 
@@ -348,21 +432,16 @@ impl<'a> Pipeline<'a> {
             iterations: 0,
             probability: 0.0,
             covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
-            reasons: judge(&Evidence::none(points)).reasons,
+            reasons: judge(&Evidence::none(points), &self.calibration).reasons,
+            alternatives: Vec::new(),
+            source_scale: None,
+            evidence: Evidence::none(points),
             method: self.settings.method,
             voxel_size: self.voxel_size,
             settings: Settings { voxel_size: Some(self.voxel_size), ..self.settings.clone() },
             timings_ms: Timings::default(),
         }
     }
-}
-
-/// Keeps the best `count` at most, and of those only what scores nearly as well as the best.
-fn keep_promising(scored: &mut Vec<(f64, Hypothesis)>, count: usize) {
-    scored.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let enough = scored.first().map_or(0.0, |best| PROMISING * best.0);
-    scored.retain(|&(score, _)| score >= enough);
-    scored.truncate(count);
 }
 
 /// Matched points lie this many coarse voxels apart at most under a right pose.

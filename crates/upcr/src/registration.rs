@@ -5,6 +5,7 @@ use serde::Serialize;
 use crate::{
     settings::{Method, Settings},
     transform::Rigid,
+    verify::Evidence,
 };
 
 /// What a caveat is about.
@@ -22,6 +23,8 @@ pub enum Reason {
     DegenerateAxis,
     /// Too few points to tell.
     TooFewPoints,
+    /// The clouds seem to be in different units: see [`Registration::source_scale`].
+    ScaleMismatch,
     /// The refinement did not settle: no inliers to settle on, or no iterations left.
     NotConverged,
     /// The surfaces lie near each other, but not as closely as right poses let them.
@@ -36,6 +39,9 @@ impl std::fmt::Display for Reason {
             Self::Ambiguous => "another, different pose explains the clouds nearly as well",
             Self::DegenerateAxis => "some direction of motion is not held by the geometry",
             Self::TooFewPoints => "there are too few points to tell",
+            Self::ScaleMismatch => {
+                "the clouds differ so much in size that they seem to be in different units"
+            }
             Self::NotConverged => "the refinement did not settle",
             Self::PoorFit => "the surfaces lie near each other, but not as closely as a right pose lets them",
         })
@@ -55,6 +61,15 @@ pub struct Timings {
     pub verify: f64,
     /// All of it, from call to return.
     pub total: f64,
+}
+
+/// Another pose that explains the clouds nearly as well.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Alternative {
+    /// As [`Registration::T_target_source`].
+    pub T_target_source: Rigid,
+    /// Its score over that of the pose returned: 1 is as good.
+    pub relative_score: f64,
 }
 
 /// The one result, whatever the method, always completely filled.
@@ -79,6 +94,13 @@ pub struct Registration {
     pub covariance: [[f64; 6]; 6],
     /// What speaks against the pose.
     pub reasons: Vec<Reason>,
+    /// Other poses that explain the clouds nearly as well, best first: those of a square table turned by quarters.
+    pub alternatives: Vec<Alternative>,
+    /// The factor by which the source's lengths have to be multiplied for the clouds to fit, where they do not fit as they
+    /// are and do with it.
+    pub source_scale: Option<f64>,
+    /// What the probability is made of.
+    pub evidence: Evidence,
     /// Which source the winning hypothesis came from.
     pub method: Method,
     /// The scale used, in the clouds' unit.

@@ -11,6 +11,7 @@ use crate::{
     net::Network,
     refine::{Locks, Refinement, RobustKernel},
     transform::Rigid,
+    verify::Calibration,
 };
 
 /// Where the first pose comes from.
@@ -58,6 +59,9 @@ pub struct Settings {
     pub overlap: Option<f64>,
     /// Degrees of freedom held at the initial pose's values.
     pub locks: Locks,
+    /// What the evidence weighs; `None`: the calibration in the library.
+    #[serde(serialize_with = "about")]
+    pub calibration: Option<Arc<Calibration>>,
     /// Seed of every random choice.
     pub seed: u64,
     /// Threads to use; `None`: all that the current rayon pool has. The result does not depend on it.
@@ -76,6 +80,7 @@ impl Default for Settings {
             kernel: RobustKernel::default(),
             overlap: None,
             locks: Locks::default(),
+            calibration: None,
             seed: 0,
             threads: None,
         }
@@ -110,6 +115,15 @@ impl Settings {
 fn fingerprint<S: Serializer>(network: &Option<Arc<Network>>, serializer: S) -> Result<S::Ok, S::Error> {
     match network {
         Some(network) => serializer.collect_str(&format_args!("{:016x}", network.fingerprint())),
+        None => serializer.serialize_none(),
+    }
+}
+
+/// A calibration is told by what it says of itself.
+#[allow(clippy::ref_option)] // as serde calls it
+fn about<S: Serializer>(calibration: &Option<Arc<Calibration>>, serializer: S) -> Result<S::Ok, S::Error> {
+    match calibration {
+        Some(calibration) => serializer.serialize_some(&calibration.about),
         None => serializer.serialize_none(),
     }
 }

@@ -5,6 +5,7 @@ mod mesh;
 mod normals;
 mod outliers;
 mod sample;
+mod spread;
 mod summary;
 pub(crate) mod voxel;
 
@@ -13,6 +14,7 @@ pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient
 pub(crate) use normals::{nearest_planes, plane_normal};
 pub use outliers::statistical_inliers;
 pub use sample::{farthest_points, random_indices};
+pub(crate) use spread::{deviations, mean, principal_axes};
 pub use summary::Summary;
 
 use crate::transform::Rigid;

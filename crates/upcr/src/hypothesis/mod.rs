@@ -5,11 +5,13 @@ mod fgr;
 mod matching;
 mod prior;
 mod ransac;
+mod turns;
 mod upcr;
 
 use matching::are_congruent;
 pub(crate) use matching::{Match, match_levels};
-pub(crate) use upcr::are_alike;
+pub(crate) use turns::turned;
+pub(crate) use upcr::{ALIKE, are_alike};
 
 use crate::{net::Network, prepare::Prepared, settings::Method, transform::Rigid};
 
@@ -48,10 +50,6 @@ pub(crate) trait HypothesisSource: Sync {
         0.75
     }
     fn propose(&self, problem: &Problem) -> Vec<Hypothesis>;
-    /// Other poses that might look as right as `best`, the best proposal once it lies closely; judged beside it.
-    fn alternatives(&self, _problem: &Problem, _best: &Rigid) -> Vec<Hypothesis> {
-        Vec::new()
-    }
 }
 
 /// Every source, cheapest first.

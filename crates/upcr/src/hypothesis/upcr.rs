@@ -1,10 +1,11 @@
 //! The UPCR network's pose, once and again on the moved source while the clouds come closer.
 
-use nalgebra::{Matrix3, Rotation3, SymmetricEigen, U3, Unit, Vector3};
+use nalgebra::Vector3;
 
 use super::{Hypothesis, HypothesisSource, Problem};
 use crate::{
-    PointCloud, net::Network, prepare::Level, settings::Method, transform::Rigid, verify::overlap_at,
+    PointCloud, cloud::deviations, net::Network, prepare::Level, settings::Method, transform::Rigid,
+    verify::overlap_at,
 };
 
 /// Points that the network learned from, and that it sees here at most: its pose is only a first one.
@@ -21,12 +22,9 @@ const CLOSE: f64 = 0.9;
 /// shapes that overlap well have more, wrong ones of scenes less.
 const FAR_OFF: f64 = 0.6;
 const HOPELESS: f64 = 0.8;
-/// Points that tell how a cloud is spread, and how little the spreads of two views of one whole differ, as a share of
-/// the largest: noise changes less, a crop mostly more.
-const SPREAD_POINTS: usize = 4096;
-const ALIKE: f64 = 0.03;
-/// Turns about each principal axis that stand beside the network's pose.
-const TURNS: u32 = 12;
+/// How little the spreads of two views of one whole differ, as a share of the largest: noise changes less, a crop mostly
+/// more.
+pub(crate) const ALIKE: f64 = 0.03;
 
 pub(super) struct Upcr;
 
@@ -35,32 +33,6 @@ pub(super) struct Upcr;
 pub(crate) fn are_alike(source: &PointCloud, target: &PointCloud) -> bool {
     let (a, b) = (deviations(source), deviations(target));
     (a - b).amax() <= ALIKE * a.amax().max(b.amax())
-}
-
-/// Standard deviations along the principal axes, largest first.
-fn deviations(cloud: &PointCloud) -> Vector3<f64> {
-    let step = cloud.len().div_ceil(SPREAD_POINTS).max(1);
-    let mut deviations = principal_axes(cloud.points.iter().step_by(step).copied()).eigenvalues;
-    deviations.as_mut_slice().sort_by(|a, b| b.total_cmp(a));
-    deviations.map(|variance| variance.max(0.0).sqrt())
-}
-
-/// Eigenvectors and eigenvalues of the covariance.
-fn principal_axes(points: impl ExactSizeIterator<Item = [f64; 3]> + Clone) -> SymmetricEigen<f64, U3> {
-    let weight = 1.0 / points.len().max(1) as f64;
-    let mean = mean(points.clone());
-    let covariance: Matrix3<f64> = points
-        .map(|p| {
-            let d = Vector3::from(p) - mean;
-            d * d.transpose() * weight
-        })
-        .sum();
-    covariance.symmetric_eigen()
-}
-
-fn mean(points: impl ExactSizeIterator<Item = [f64; 3]>) -> Vector3<f64> {
-    let weight = 1.0 / points.len().max(1) as f64;
-    points.map(|p| Vector3::from(p) * weight).sum()
 }
 
 impl HypothesisSource for Upcr {
@@ -133,28 +105,6 @@ impl HypothesisSource for Upcr {
         }
         vec![Hypothesis { pose, method: Method::Upcr, support: 0 }]
     }
-
-    /// The network has one answer: whether a nearly symmetric shape has a better one, or another as good, only a
-    /// comparison tells.
-    fn alternatives(&self, problem: &Problem, best: &Rigid) -> Vec<Hypothesis> {
-        turns(&sample(&problem.source.fine))
-            .map(|turn| Hypothesis { pose: *best * turn, method: Method::Upcr, support: 0 })
-            .collect()
-    }
-}
-
-/// Turns of the points about their principal axes.
-fn turns(points: &[[f32; 3]]) -> impl Iterator<Item = Rigid> {
-    let points = points.iter().map(|p| p.map(f64::from));
-    let (mean, axes) = (mean(points.clone()), principal_axes(points).eigenvectors);
-    (0..3).flat_map(move |axis| {
-        let axis = Unit::new_normalize(axes.column(axis).into_owned());
-        (1..TURNS).map(move |step| {
-            let angle = std::f64::consts::TAU * f64::from(step) / f64::from(TURNS);
-            let rotation = Rotation3::from_axis_angle(&axis, angle).into_inner();
-            Rigid { rotation, translation: mean - rotation * mean }
-        })
-    })
 }
 
 fn sample(level: &Level) -> Vec<[f32; 3]> {
@@ -169,6 +119,8 @@ fn spread(points: &[[f32; 3]]) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Rotation3;
+
     use super::*;
 
     #[test]

@@ -1,9 +1,16 @@
 //! Is the pose right? Overlap on held-out points, the runner-up, conditioning, and a probability from them.
 
+mod calibration;
 mod conditioning;
+mod evidence;
 mod overlap;
+mod scale;
 mod verdict;
 
+pub use calibration::{Calibration, FEATURES};
 pub(crate) use conditioning::{conditioning, covariance};
-pub(crate) use overlap::{distances, overlap_at};
-pub(crate) use verdict::{Evidence, judge};
+pub use evidence::Evidence;
+pub(crate) use evidence::{meeting, seen};
+pub(crate) use overlap::overlap_at;
+pub(crate) use scale::{Sizes, scaled};
+pub(crate) use verdict::judge;

@@ -8,10 +8,10 @@ use crate::{prepare::Level, transform::Rigid};
 const BLOCK: usize = 128;
 
 /// Squared distances of some points of one cloud to the nearest of the other; infinite beyond the limit.
-pub(crate) struct Distances(Vec<f32>);
+struct Distances(Vec<f32>);
 
 /// Distances of the points `indices` of `from`, moved by `pose`, to `to`, as far as `limit`.
-pub(crate) fn distances(from: &Level, indices: &[u32], to: &Level, pose: &Rigid, limit: f32) -> Distances {
+fn distances(from: &Level, indices: &[u32], to: &Level, pose: &Rigid, limit: f32) -> Distances {
     let rotation = pose.rotation.map(|v| v as f32);
     let translation = pose.translation.map(|v| v as f32);
     let one = |&i: &u32| {
@@ -22,36 +22,11 @@ pub(crate) fn distances(from: &Level, indices: &[u32], to: &Level, pose: &Rigid,
 }
 
 impl Distances {
-    /// Number of points.
-    pub fn len(&self) -> usize {
-        self.0.len()
-    }
-
-    /// How many are within `limit`.
-    pub fn within(&self, limit: f32) -> usize {
-        self.0.iter().filter(|&&d| d <= limit * limit).count()
-    }
-
-    /// Share of points within `limit`, 0 to 1.
-    pub fn share(&self, limit: f32) -> f64 {
-        self.within(limit) as f64 / self.len().max(1) as f64
-    }
-
-    /// Root mean square of the distances within `limit`.
-    pub fn rmse(&self, limit: f32) -> f64 {
-        let (sum, count) = self
-            .0
-            .iter()
-            .filter(|&&d| d <= limit * limit)
-            .fold((0.0, 0), |(s, c), &d| (s + f64::from(d), c + 1));
-        (sum / f64::from(count.max(1))).sqrt()
-    }
-
     /// Mean of max(0, 1 − d²/limit²): truncated least squares turned into a score from 0 to 1.
-    pub fn score(&self, limit: f32) -> f64 {
+    fn score(&self, limit: f32) -> f64 {
         let scale = 1.0 / (limit * limit);
         let sum: f64 = self.0.iter().map(|&d| f64::from((1.0 - d * scale).max(0.0))).sum();
-        sum / self.len().max(1) as f64
+        sum / self.0.len().max(1) as f64
     }
 }
 

@@ -1,5 +1,6 @@
 //! From evidence to a probability and reasons.
 
+use super::{Calibration, Evidence};
 use crate::registration::{Reason, TRUSTWORTHY};
 
 /// Fewer held-out points than this within reach of the other cloud say nothing.
@@ -9,50 +10,14 @@ const FEWEST_POINTS: usize = 50;
 /// Overlap under which a pose is called a pose of clouds that share nothing, and that share little.
 const NO_OVERLAP: f64 = 0.1;
 const LOW_OVERLAP: f64 = 0.3;
-/// A runner-up this close in score is as good an answer.
-const AMBIGUOUS_MARGIN: f64 = 0.05;
 /// Information, relative to the best held direction, under which a direction is free. Real scans of rooms,
 /// streets and statues have 0.005 and more; planes and cylinders under scanner noise less than 0.001.
 const FREE_DIRECTION: f64 = 0.0015;
-/// Residuals this small (see [`Evidence::sharpness`]) show that points were sampled once and then moved: then
+/// Residuals this small show that points were sampled once and then moved: then
 /// the samples hold the pose where the shape does not.
 const SAME_SAMPLES: f64 = 0.9;
 /// A caveat that speaks against the pose itself leaves at most this.
 const DOUBTFUL: f64 = 0.45;
-
-/// What is known about a pose once it is found.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Evidence {
-    /// Share of held-out source points near the target, and of held-out target points near the source.
-    pub overlap: [f64; 2],
-    /// Held-out points near the other cloud, both directions.
-    pub inliers: usize,
-    /// Score over several scales relative to the coarsest: 1 where residuals vanish.
-    pub sharpness: f64,
-    /// Score of the best clearly different pose over that of this one; 0 where there is none.
-    pub runner_up: f64,
-    /// Ratio of the worst to the best held direction.
-    pub conditioning: f64,
-    /// Whether the refinement settled.
-    pub converged: bool,
-    /// Points of the smaller cloud.
-    pub points: usize,
-}
-
-impl Evidence {
-    /// Of a pose that nothing speaks for, between clouds of at least `points` points.
-    pub fn none(points: usize) -> Self {
-        Self {
-            overlap: [0.0; 2],
-            inliers: 0,
-            sharpness: 0.0,
-            runner_up: 0.0,
-            conditioning: 0.0,
-            converged: true,
-            points,
-        }
-    }
-}
 
 /// Probability and reasons.
 #[derive(Debug, Clone, PartialEq)]
@@ -62,7 +27,7 @@ pub(crate) struct Verdict {
 }
 
 /// Weighs the evidence.
-pub(crate) fn judge(e: &Evidence) -> Verdict {
+pub(crate) fn judge(e: &Evidence, calibration: &Calibration) -> Verdict {
     let overlap = e.overlap[0].max(e.overlap[1]);
     let mut reasons = Vec::new();
     if e.points < FEWEST_POINTS || (overlap >= NO_OVERLAP && e.inliers < FEWEST_INLIERS) {
@@ -75,14 +40,14 @@ pub(crate) fn judge(e: &Evidence) -> Verdict {
         if overlap < LOW_OVERLAP {
             reasons.push(Reason::LowOverlap);
         }
-        if 1.0 - e.runner_up < AMBIGUOUS_MARGIN {
+        if e.rivals > 0 {
             reasons.push(Reason::Ambiguous);
         }
-        if e.conditioning < FREE_DIRECTION && e.sharpness < SAME_SAMPLES {
+        if e.conditioning < FREE_DIRECTION && e.closeness < SAME_SAMPLES {
             reasons.push(Reason::DegenerateAxis);
         }
     }
-    let mut probability = logistic(e);
+    let mut probability = calibration.probability(e);
     if !reasons.is_empty() {
         let against_the_pose = |r: &Reason| *r != Reason::LowOverlap;
         if reasons.iter().any(against_the_pose) {
@@ -100,15 +65,6 @@ pub(crate) fn judge(e: &Evidence) -> Verdict {
     Verdict { probability, reasons }
 }
 
-/// Logistic regression over overlap, closeness and margin, fitted on 1,900 pairs of training shapes and virtual
-/// scans: consistent, noisy, cropped, of little overlap, and of different things.
-fn logistic(e: &Evidence) -> f64 {
-    let (larger, smaller) = (e.overlap[0].max(e.overlap[1]), e.overlap[0].min(e.overlap[1]));
-    let margin = (1.0 - e.runner_up).min(0.6);
-    let logit = -12.38 - 2.53 * larger + 6.13 * smaller + 18.96 * e.sharpness + 4.79 * margin;
-    1.0 / (1.0 + (-logit).exp())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -116,16 +72,27 @@ mod tests {
     const GOOD: Evidence = Evidence {
         overlap: [0.8, 0.8],
         inliers: 1000,
-        sharpness: 0.75,
+        closeness: 0.75,
+        residual_ratio: 0.9,
+        near_misses: 0.2,
+        facing: [0.9, 0.95],
         runner_up: 0.5,
+        glimpsed: 0.5,
+        rivals: 0,
+        agreement: 0.5,
+        matches: Some([200, 800]),
         conditioning: 0.02,
         converged: true,
         points: 5000,
     };
 
+    fn verdict_on(evidence: &Evidence) -> Verdict {
+        judge(evidence, &Calibration::embedded().unwrap())
+    }
+
     #[test]
     fn good_evidence_is_trusted_and_needs_no_reason() {
-        let verdict = judge(&GOOD);
+        let verdict = verdict_on(&GOOD);
         assert!(verdict.probability > 0.9 && verdict.reasons.is_empty(), "{verdict:?}");
     }
 
@@ -135,24 +102,25 @@ mod tests {
             (Evidence { overlap: [0.02, 0.03], ..GOOD }, Reason::NoOverlap),
             (Evidence { inliers: 5, ..GOOD }, Reason::TooFewPoints),
             (Evidence { overlap: [0.2, 0.2], ..GOOD }, Reason::LowOverlap),
-            (Evidence { runner_up: 0.99, ..GOOD }, Reason::Ambiguous),
+            (Evidence { rivals: 1, ..GOOD }, Reason::Ambiguous),
             (Evidence { conditioning: 1e-5, ..GOOD }, Reason::DegenerateAxis),
             (Evidence { points: 20, ..GOOD }, Reason::TooFewPoints),
-            (Evidence { sharpness: 0.3, ..GOOD }, Reason::PoorFit),
+            (Evidence { closeness: 0.3, ..GOOD }, Reason::PoorFit),
         ];
         for (evidence, reason) in cases {
-            let verdict = judge(&evidence);
+            let verdict = verdict_on(&evidence);
             assert!(verdict.reasons.contains(&reason), "{evidence:?}: {verdict:?}");
-            assert!(verdict.probability < judge(&GOOD).probability, "{evidence:?}: {verdict:?}");
+            assert!(verdict.probability < verdict_on(&GOOD).probability, "{evidence:?}: {verdict:?}");
         }
     }
 
     #[test]
     fn no_distrust_without_a_reason() {
         for overlap in [0.0, 0.15, 0.5, 0.9] {
-            for sharpness in [0.0, 0.4, 0.6, 1.0] {
+            for closeness in [0.0, 0.4, 0.6, 1.0] {
                 for runner_up in [0.0, 0.8, 1.2] {
-                    let verdict = judge(&Evidence { overlap: [overlap; 2], sharpness, runner_up, ..GOOD });
+                    let verdict =
+                        verdict_on(&Evidence { overlap: [overlap; 2], closeness, runner_up, ..GOOD });
                     assert!(verdict.probability >= TRUSTWORTHY || !verdict.reasons.is_empty());
                 }
             }

@@ -1,0 +1,95 @@
+//! Logistic regression of right and wrong over the evidence.
+
+use nalgebra::{DMatrix, DVector, SVector};
+use upcr::{Calibration, FEATURES};
+
+use super::observe::Observed;
+
+const COUNT: usize = FEATURES.len();
+/// Ridge on the weights of standardised features: keeps them finite where a feature tells right from wrong alone.
+const RIDGE: f64 = 0.1;
+/// Newton steps at most, and the largest change of a weight that counts as settled.
+const STEPS: usize = 50;
+const SETTLED: f64 = 1e-9;
+
+/// The weights under which what was seen of the poses is most probable, given which of them were right.
+pub fn fit(observed: &[Observed], about: String) -> Calibration {
+    let rows: Vec<SVector<f64, COUNT>> = observed.iter().map(|o| o.evidence.features().into()).collect();
+    let n = rows.len().max(1) as f64;
+    let mean = rows.iter().sum::<SVector<f64, COUNT>>() / n;
+    let variance =
+        rows.iter().map(|r| (r - mean).component_mul(&(r - mean))).sum::<SVector<f64, COUNT>>() / n;
+    // A feature that never changes has nothing to say.
+    let scale = variance.map(|v| if v > 1e-12 { 1.0 / v.sqrt() } else { 0.0 });
+    let standard: Vec<SVector<f64, COUNT>> = rows.iter().map(|r| (r - mean).component_mul(&scale)).collect();
+
+    // Intercept first.
+    let mut weights = DVector::<f64>::zeros(COUNT + 1);
+    for _ in 0..STEPS {
+        let mut gradient = DVector::<f64>::zeros(COUNT + 1);
+        let mut hessian = DMatrix::<f64>::zeros(COUNT + 1, COUNT + 1);
+        for (row, o) in standard.iter().zip(observed) {
+            let x = DVector::from_iterator(COUNT + 1, std::iter::once(1.0).chain(row.iter().copied()));
+            let p = 1.0 / (1.0 + (-weights.dot(&x)).exp());
+            gradient += &x * (p - f64::from(o.right));
+            hessian += &x * x.transpose() * (p * (1.0 - p)).max(1e-9);
+        }
+        for k in 1..=COUNT {
+            gradient[k] += RIDGE * weights[k];
+            hessian[(k, k)] += RIDGE;
+        }
+        let Some(step) = hessian.cholesky().map(|h| h.solve(&gradient)) else { break };
+        weights -= &step;
+        if step.amax() < SETTLED {
+            break;
+        }
+    }
+    let plain: [f64; COUNT] = std::array::from_fn(|k| weights[k + 1] * scale[k]);
+    let shift: f64 = plain.iter().zip(mean.iter()).map(|(w, m)| w * m).sum();
+    Calibration::new(about, weights[0] - shift, plain)
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::Rng;
+    use upcr::Evidence;
+
+    use super::*;
+    use crate::random;
+    use crate::trust::cases::Kind;
+
+    /// Pairs whose poses are right with a probability that overlap and closeness tell.
+    fn drawn(count: u64) -> Vec<(Observed, f64)> {
+        let one = |index| {
+            let mut rng = random::stream(5, index);
+            let overlap = rng.random_range(0.0..1.0);
+            let closeness = rng.random_range(0.0..1.0);
+            let p = 1.0 / (1.0 + (8.0 - 6.0 * overlap - 10.0 * closeness as f64).exp());
+            let evidence = Evidence { overlap: [overlap; 2], closeness, ..Evidence::none(500) };
+            let right = rng.random_bool(p);
+            (Observed { kind: Kind::Partial, right, probability: 0.0, evidence, reasons: Vec::new() }, p)
+        };
+        (0..count).map(one).collect()
+    }
+
+    #[test]
+    fn the_law_that_draws_right_and_wrong_is_found() {
+        let drawn = drawn(4000);
+        let observed: Vec<Observed> = drawn.iter().map(|(o, _)| o.clone()).collect();
+        let calibration = fit(&observed, "test".into());
+        let off =
+            drawn.iter().map(|(o, p)| (calibration.probability(&o.evidence) - p).abs()).fold(0.0, f64::max);
+        assert!(off < 0.08, "{off}");
+        // Features that were alike in all pairs weigh nothing.
+        assert_eq!(calibration.weights["no_matches"], 0.0);
+    }
+
+    #[test]
+    fn where_all_poses_are_right_the_probability_is_high_and_finite() {
+        let observed: Vec<Observed> =
+            drawn(200).into_iter().map(|(o, _)| Observed { right: true, ..o }).collect();
+        let calibration = fit(&observed, "test".into());
+        let p = calibration.probability(&observed[0].evidence);
+        assert!(p > 0.9 && p <= 1.0, "{p}");
+    }
+}

@@ -1,0 +1,131 @@
+//! The probability that a pose is right: a logistic regression over the evidence, in a file that can be read.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::{Arc, OnceLock};
+
+use serde::{Deserialize, Serialize};
+
+use super::Evidence;
+use crate::{Error, Result};
+
+/// The default, fitted on training shapes and virtual scans.
+const EMBEDDED: &str = include_str!("calibration.json");
+
+/// What [`Evidence`] becomes before it is weighed, one number each.
+pub const FEATURES: [&str; 17] = [
+    "smaller_overlap",
+    "larger_overlap",
+    "closeness",
+    "ln_residual_ratio",
+    "near_misses",
+    "facing",
+    "ln_facing_ratio",
+    "margin",
+    "glimpsed",
+    "rivals",
+    "agreement",
+    "ln_explained_matches",
+    "explained_share",
+    "no_matches",
+    "ln_inliers",
+    "ln_points",
+    "ln_conditioning",
+];
+
+impl Evidence {
+    /// The numbers that [`FEATURES`] names; ratios and counts as logarithms, all within bounds.
+    pub fn features(&self) -> [f64; FEATURES.len()] {
+        let [source, target] = self.overlap;
+        let explained = self.matches.map_or(0.0, |[explained, _]| explained as f64);
+        let share = self.matches.map_or(0.0, |[explained, of]| explained as f64 / of.max(1) as f64);
+        let [facing, own_facing] = self.facing;
+        [
+            source.min(target),
+            source.max(target),
+            self.closeness,
+            self.residual_ratio.max(f64::MIN_POSITIVE).ln().clamp(-3.0, 3.0),
+            self.near_misses,
+            facing,
+            ((facing + 0.01) / (own_facing + 0.01)).ln(),
+            (1.0 - self.runner_up).clamp(0.0, 0.6),
+            self.glimpsed.min(1.0),
+            self.rivals.min(3) as f64,
+            self.agreement,
+            explained.ln_1p(),
+            share,
+            f64::from(self.matches.is_none()),
+            (self.inliers as f64).ln_1p(),
+            (self.points.max(1) as f64).ln(),
+            self.conditioning.max(1e-6).ln(),
+        ]
+    }
+}
+
+/// Weights of the evidence: the logit of the probability is the intercept plus the weighted sum of [`FEATURES`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Calibration {
+    /// What counted as right where the weights were fitted, and on how much of what; for readers.
+    pub about: String,
+    /// The logit where all features are zero.
+    pub intercept: f64,
+    /// A weight for each of [`FEATURES`], by name.
+    pub weights: BTreeMap<String, f64>,
+}
+
+impl Calibration {
+    /// The calibration in the library.
+    ///
+    /// # Errors
+    /// Never, unless the library was built from a broken file.
+    pub fn embedded() -> Result<Arc<Self>> {
+        static PARSED: OnceLock<Option<Arc<Calibration>>> = OnceLock::new();
+        let parsed = PARSED.get_or_init(|| Self::parse(EMBEDDED).ok().map(Arc::new));
+        parsed.clone().ok_or_else(|| invalid("the one in the library cannot be read".into()))
+    }
+
+    /// The calibration in a file that `upcr calibrate` wrote.
+    ///
+    /// # Errors
+    /// Where the file cannot be read or is no calibration.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self> {
+        let path = path.as_ref();
+        let text =
+            std::fs::read_to_string(path).map_err(|source| Error::Io { path: path.to_owned(), source })?;
+        Self::parse(&text).map_err(|reason| Error::Malformed {
+            path: path.to_owned(),
+            format: "calibration",
+            reason,
+        })
+    }
+
+    /// From weights in the order of [`FEATURES`].
+    pub fn new(about: String, intercept: f64, weights: [f64; FEATURES.len()]) -> Self {
+        let weights = FEATURES.iter().map(|name| (*name).to_owned()).zip(weights).collect();
+        Self { about, intercept, weights }
+    }
+
+    /// The probability that a pose is right of which this is known, 0 to 1.
+    pub fn probability(&self, evidence: &Evidence) -> f64 {
+        let weighted =
+            self.weights.iter().zip(evidence.features()).map(|((_, weight), value)| weight * value);
+        let logit = self.intercept + weighted.sum::<f64>();
+        1.0 / (1.0 + (-logit).exp())
+    }
+
+    fn parse(text: &str) -> std::result::Result<Self, String> {
+        let found: Self = serde_json::from_str(text).map_err(|error| error.to_string())?;
+        if found.weights.len() != FEATURES.len() || !FEATURES.iter().all(|f| found.weights.contains_key(*f)) {
+            return Err(format!("its weights are not those of {}", FEATURES.join(", ")));
+        }
+        if !found.intercept.is_finite() || found.weights.values().any(|weight| !weight.is_finite()) {
+            return Err("a weight is not finite".into());
+        }
+        Ok(found)
+    }
+}
+
+fn invalid(reason: String) -> Error {
+    Error::InvalidSetting { name: "calibration", reason }
+}
