@@ -10,7 +10,7 @@ use crate::{
     features::MatchedFeature,
     net::Network,
     refine::{Locks, Refinement, RobustKernel},
-    transform::Rigid,
+    transform::{Rigid, nearest_rotation},
 };
 
 /// Where the first pose comes from.
@@ -83,6 +83,12 @@ impl Default for Settings {
 }
 
 impl Settings {
+    /// The first guess, its rotation exactly one; the identity where none is given.
+    pub(crate) fn first_guess(&self) -> Rigid {
+        self.init
+            .map_or_else(Rigid::identity, |init| Rigid { rotation: nearest_rotation(&init.rotation), ..init })
+    }
+
     /// Refuses what is out of range.
     pub(crate) fn check(&self) -> Result<()> {
         let refused = |name, reason| Err(Error::InvalidSetting { name, reason });

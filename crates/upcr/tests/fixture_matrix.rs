@@ -343,6 +343,18 @@ fn a_first_guess_that_is_no_pose() {
     }
 }
 
+/// A first guess whose matrix somebody rounded comes back as a rotation, also from where there is nothing to refine.
+#[test]
+fn a_first_guess_that_is_rounded() {
+    let pair = Pair::sample(3);
+    let init = perturbed(&pair);
+    let init = Rigid { rotation: init.rotation.map(|v| (v * 1e4).round() / 1e4), ..init };
+    for method in [Method::Prior, Method::Upcr] {
+        let settings = Settings { method, refine: Refinement::None, init: Some(init), ..Settings::default() };
+        assert_consistent(&register(&pair.source, &pair.target, &settings).unwrap());
+    }
+}
+
 /// A scale beyond the clouds leaves nothing to register; that is said, in whichever way.
 #[test]
 fn a_scale_beyond_the_clouds() {
