@@ -43,6 +43,11 @@ impl<T: Read + Seek> Stream for T {}
 /// Longest line that is taken for text; more means a binary file read as text.
 const LONGEST_LINE: u64 = 1 << 20;
 
+/// Points that any compressed file may hold, and more for each of its bytes: all alike, billions of them would fit into
+/// a megabyte. No measurement comes near.
+const MOST_POINTS: u64 = 1 << 23;
+const MOST_POINTS_A_BYTE: u64 = 8;
+
 /// Bytes of records read in one go.
 const CHUNK: usize = 1 << 20;
 
@@ -157,6 +162,14 @@ impl<'a> Input<'a> {
     pub(super) fn bad_line<T>(&self, reason: impl std::fmt::Display) -> Fallible<T> {
         malformed(format!("line {}: {reason}", self.line_number))
     }
+}
+
+/// Fails where a file of `len` bytes is too short for `count` compressed points that are not nearly all alike.
+pub(super) fn check_expansion(len: u64, count: u64) -> Fallible<()> {
+    if count > MOST_POINTS.saturating_add(len.saturating_mul(MOST_POINTS_A_BYTE)) {
+        return unsupported(format!("{count} points are too many for a file of {len} bytes"));
+    }
+    Ok(())
 }
 
 /// The words of a text file one after the other, wherever its lines end.

@@ -134,6 +134,7 @@ const POINTS_AT: usize = 96;
 const RECORDS: usize = 100;
 const POINT_FORMAT: usize = 104;
 const RECORD_LENGTH: usize = 105;
+const COUNT: usize = 107;
 const HEADER: usize = 227;
 
 fn las() -> [(String, Vec<u8>); 3] {
@@ -143,7 +144,7 @@ fn las() -> [(String, Vec<u8>); 3] {
     newer[25] = 4;
     newer[94..96].copy_from_slice(&375u16.to_le_bytes());
     newer.splice(HEADER..HEADER, [0; 148]);
-    newer[107..111].fill(0);
+    newer[COUNT..COUNT + 4].fill(0);
     newer[247..255].copy_from_slice(&3u64.to_le_bytes());
     newer[POINTS_AT..POINTS_AT + 4].copy_from_slice(&375u32.to_le_bytes());
     [
@@ -167,22 +168,31 @@ fn laz() -> Vec<(String, Vec<u8>)> {
 
 /// A few compressed records, all of whose fields change.
 fn compressed(point_format: u8, extra: u8, variable: bool) -> Vec<u8> {
-    use laz::{LazVlr, LazVlrBuilder};
-
-    let vlr = LazVlrBuilder::default().with_point_format(point_format, extra.into()).unwrap();
+    let vlr = laz::LazVlrBuilder::default().with_point_format(point_format, extra.into()).unwrap();
     let vlr = if variable { vlr.with_variable_chunk_size() } else { vlr.with_fixed_chunk_size(4) }.build();
+    let length = vlr.items_size() as usize;
+    // Small steps, since the coder takes no others of time.
+    let record = |i: u8| (0..length).map(|at| if at % 4 == 0 { 7 * i + 3 } else { 0 }).collect::<Vec<u8>>();
+    let cut = if variable { 4 } else { 6 };
+    let chunks = [0..cut, cut..6].into_iter().filter(|chunk| !chunk.is_empty());
+    let chunks = chunks.map(|chunk| chunk.flat_map(record).collect());
+    laz_file(vlr, point_format, chunks)
+}
+
+/// A file of chunks of records, as the compression described by `vlr` cuts them, or as they are where it leaves that open.
+pub fn laz_file(vlr: laz::LazVlr, point_format: u8, chunks: impl Iterator<Item = Vec<u8>>) -> Vec<u8> {
+    use laz::LazVlr;
+
     let mut description = Vec::new();
     vlr.write_to(&mut description).unwrap();
-    let record_length: u16 = vlr.items().iter().map(laz::LazItem::size).sum();
-    let count = 6u8;
-
-    let mut file = written("las", &PointCloud::from_points(vec![[0.0; 3]; count.into()]), Encoding::Binary);
+    let length = vlr.items_size() as u16;
+    let mut file = written("las", &bare(1), Encoding::Binary);
     file.truncate(HEADER);
     let points_at = HEADER + 54 + description.len();
     file[POINTS_AT..POINTS_AT + 4].copy_from_slice(&(points_at as u32).to_le_bytes());
     file[RECORDS..RECORDS + 4].copy_from_slice(&1u32.to_le_bytes());
     file[POINT_FORMAT] = point_format | 0x80;
-    file[RECORD_LENGTH..RECORD_LENGTH + 2].copy_from_slice(&record_length.to_le_bytes());
+    file[RECORD_LENGTH..RECORD_LENGTH + 2].copy_from_slice(&length.to_le_bytes());
     let mut head = [0; 54];
     head[2..2 + LazVlr::USER_ID.len()].copy_from_slice(LazVlr::USER_ID.as_bytes());
     head[18..20].copy_from_slice(&LazVlr::RECORD_ID.to_le_bytes());
@@ -190,19 +200,22 @@ fn compressed(point_format: u8, extra: u8, variable: bool) -> Vec<u8> {
     file.extend(head);
     file.extend(&description);
 
+    let variable = vlr.uses_variable_size_chunks();
     let mut out = Cursor::new(file);
     out.set_position(points_at as u64);
     let mut compressor = laz::LasZipCompressor::new(out, vlr).unwrap();
-    for i in 0..count {
-        // Small steps, since the coder takes no others of time.
-        let record: Vec<u8> = (0..record_length).map(|at| if at % 4 == 0 { 7 * i + 3 } else { 0 }).collect();
-        compressor.compress_one(&record).unwrap();
-        if variable && i == 3 {
+    let mut count = 0;
+    for (i, chunk) in chunks.enumerate() {
+        if variable && i > 0 {
             compressor.finish_current_chunk().unwrap();
         }
+        compressor.compress_many(&chunk).unwrap();
+        count += chunk.len() / usize::from(length);
     }
     compressor.done().unwrap();
-    compressor.into_inner().into_inner()
+    let mut file = compressor.into_inner().into_inner();
+    file[COUNT..COUNT + 4].copy_from_slice(&(count as u32).to_le_bytes());
+    file
 }
 
 fn e57() -> Vec<(String, Vec<u8>)> {
