@@ -74,7 +74,8 @@ pub fn inconsistencies(found: &Registration) -> Vec<String> {
 /// Whether it is finite, symmetric, and correlates nothing by more than 1.
 fn is_covariance(c: &[[f64; 6]; 6]) -> bool {
     (0..6).flat_map(|row| (0..6).map(move |column| (row, column))).all(|(row, column)| {
-        let bound = (c[row][row] * c[column][column]).sqrt() * (1.0 + 1e-6);
+        // Where residuals vanish, products of variances do before these.
+        let bound = c[row][row].sqrt() * c[column][column].sqrt() * (1.0 + 1e-6) + f64::MIN_POSITIVE;
         c[row][row] >= 0.0
             && c[row][column].is_finite()
             && c[row][column].abs() <= bound
