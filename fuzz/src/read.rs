@@ -167,7 +167,7 @@ fn weights(data: &[u8]) {
 }
 
 /// The bytes as pages of an E57 file: whole ones, each with the checksum of what it holds. No other file is looked into.
-fn sealed(data: &[u8]) -> Vec<u8> {
+pub fn sealed(data: &[u8]) -> Vec<u8> {
     const PAGE: usize = 1024;
     const CHECKSUM: usize = 4;
     let mut file = data.to_vec();
