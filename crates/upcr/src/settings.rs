@@ -3,6 +3,7 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
+use nalgebra::Matrix3;
 use serde::{Serialize, Serializer};
 
 use crate::{
@@ -83,10 +84,13 @@ impl Default for Settings {
 }
 
 impl Settings {
-    /// The first guess, its rotation exactly one; the identity where none is given.
+    /// The first guess, the identity where none is given. The matrix of one that somebody wrote down in few digits is
+    /// replaced by the nearest rotation; any other is kept to the last bit.
     pub(crate) fn first_guess(&self) -> Rigid {
-        self.init
-            .map_or_else(Rigid::identity, |init| Rigid { rotation: nearest_rotation(&init.rotation), ..init })
+        const ROUNDING: f64 = 1e-12;
+        let Some(init) = self.init else { return Rigid::identity() };
+        let departure = (init.rotation.transpose() * init.rotation - Matrix3::identity()).amax();
+        if departure < ROUNDING { init } else { Rigid { rotation: nearest_rotation(&init.rotation), ..init } }
     }
 
     /// Refuses what is out of range.

@@ -110,9 +110,9 @@ fn e57(xml: &str) -> Vec<u8> {
 
 #[test]
 fn e57_with_many_attributes_or_namespaces() {
-    let attributes: String = (0..50_000).map(|i| format!(" a{i}='>'")).collect();
+    let attributes = (0..50_000).map(|i| format!(" a{i}='>'")).collect::<Vec<_>>().concat();
     assert_refused("e57", &e57(&format!("<e57Root{attributes}/>")), "attributes");
-    let namespaces: String = (0..5000).map(|i| format!("<a xmlns:b{i}='{i}'/>")).collect();
+    let namespaces = (0..5000).map(|i| format!("<a xmlns:b{i}='{i}'/>")).collect::<Vec<_>>().concat();
     assert_refused("e57", &e57(&format!("<e57Root>{namespaces}</e57Root>")), "namespaces");
     // A file of its kind, but for what is missing.
     assert_refused("e57", &e57("<e57Root/>"), "E57");

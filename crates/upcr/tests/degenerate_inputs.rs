@@ -132,7 +132,7 @@ impl Shape {
                 .collect(),
             Self::Cluster => points.map(|_| [0; 3].map(|_| normal(rng))).collect(),
             Self::TwoClusters => {
-                let at = |i: usize| if i % 2 == 0 { 0.0 } else { 1.0 };
+                let at = |i: usize| if i.is_multiple_of(2) { 0.0 } else { 1.0 };
                 points.map(|i| [0; 3].map(|_| at(i) + 0.01 * normal(rng))).collect()
             }
             Self::Noise => points.map(|_| [0; 3].map(|_| uniform(-1.0, 1.0))).collect(),

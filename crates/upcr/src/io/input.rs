@@ -167,7 +167,7 @@ impl<'a> Input<'a> {
 /// Fails where a file of `len` bytes is too short for `count` compressed points that are not nearly all alike.
 pub(super) fn check_expansion(len: u64, count: u64) -> Fallible<()> {
     if count > MOST_POINTS.saturating_add(len.saturating_mul(MOST_POINTS_A_BYTE)) {
-        return unsupported(format!("{count} points are too many for a file of {len} bytes"));
+        return malformed(format!("{count} points are too many for a file of {len} bytes"));
     }
     Ok(())
 }

@@ -99,7 +99,7 @@ fn chunk_sizes(input: &mut Input, header: &Header, vlr: &LazVlr) -> Fallible<Vec
         return malformed(format!("the file claims {chunks} compressed chunks, more than fit in it"));
     }
     if chunks > MOST_CHUNKS + input.len / BYTES_A_CHUNK {
-        return unsupported(format!("{chunks} compressed chunks are too many for {} bytes", input.len));
+        return malformed(format!("{chunks} compressed chunks are too many for {} bytes", input.len));
     }
     input.stream.seek(SeekFrom::Start(start))?;
     let table = ChunkTable::read_from(&mut input.stream, vlr)?;
