@@ -41,6 +41,14 @@ compare *args:
     cargo build --release -p upcr-cli
     python3 bench/peers.py {{ args }}
 
+# Fuzz every reader and the registration for so many seconds in all
+fuzz seconds="3600":
+    fuzz/run "$(( {{ seconds }} * $(nproc) / $(ls fuzz/fuzz_targets | wc -l) ))"
+
+# Register so many degenerate pairs
+degenerate count="50000":
+    UPCR_DEGENERATE={{ count }} cargo test -p upcr --test degenerate_inputs -- --nocapture
+
 # All that continuous integration checks
 ci:
     .ci/run

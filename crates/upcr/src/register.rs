@@ -144,7 +144,7 @@ impl<'a> Pipeline<'a> {
         asks_network: bool,
         settings: &'a Settings,
     ) -> Result<Self> {
-        let init = settings.init.unwrap_or_else(Rigid::identity);
+        let init = settings.first_guess();
         let lock = LockedPose::new(settings.locks, &init, source.origin, target.origin);
         let init = to_local(&init, source, target);
         Ok(Self {
@@ -424,7 +424,8 @@ impl<'a> Pipeline<'a> {
         let covariance = covariance(&Matrix6::zeros(), 0.0, radius);
         let points = self.source.fine.points.len().min(self.target.fine.points.len());
         Registration {
-            T_target_source: to_file(&self.init, self.source, self.target),
+            // As it was given: what is locked is held to the last bit.
+            T_target_source: self.settings.first_guess(),
             fitness: 0.0,
             inlier_rmse: 0.0,
             num_inliers: 0,

@@ -3,6 +3,7 @@
 use std::num::NonZeroUsize;
 use std::sync::Arc;
 
+use nalgebra::Matrix3;
 use serde::{Serialize, Serializer};
 
 use crate::{
@@ -10,7 +11,7 @@ use crate::{
     features::MatchedFeature,
     net::Network,
     refine::{Locks, Refinement, RobustKernel},
-    transform::Rigid,
+    transform::{Rigid, nearest_rotation},
     verify::Calibration,
 };
 
@@ -88,6 +89,15 @@ impl Default for Settings {
 }
 
 impl Settings {
+    /// The first guess, the identity where none is given. The matrix of one that somebody wrote down in few digits is
+    /// replaced by the nearest rotation; any other is kept to the last bit.
+    pub(crate) fn first_guess(&self) -> Rigid {
+        const ROUNDING: f64 = 1e-12;
+        let Some(init) = self.init else { return Rigid::identity() };
+        let departure = (init.rotation.transpose() * init.rotation - Matrix3::identity()).amax();
+        if departure < ROUNDING { init } else { Rigid { rotation: nearest_rotation(&init.rotation), ..init } }
+    }
+
     /// Refuses what is out of range.
     pub(crate) fn check(&self) -> Result<()> {
         let refused = |name, reason| Err(Error::InvalidSetting { name, reason });

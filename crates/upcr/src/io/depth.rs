@@ -2,7 +2,7 @@
 
 use crate::PointCloud;
 
-use super::input::{Fallible, Fault, Input, malformed, unsupported};
+use super::input::{Fallible, Fault, Input, check_expansion, malformed, unsupported};
 use super::{Format, Intrinsics, ReadOptions, Reader};
 
 pub(super) const FORMAT: Format =
@@ -38,6 +38,7 @@ fn read(input: &mut Input, options: &ReadOptions) -> Fallible<PointCloud> {
         return unsupported("interlaced depth images cannot be read");
     }
     let (size, rows) = (info.size(), info.height);
+    check_expansion(input.len, u64::from(size.0) * u64::from(size.1))?;
     let camera = match options.intrinsics {
         Some(camera) => camera,
         None if size == KINECT_SIZE => KINECT,

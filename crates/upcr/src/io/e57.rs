@@ -1,5 +1,7 @@
 //! E57: all scans of a file in one cloud, each moved by its pose.
 
+use std::io::Seek;
+
 use ::e57::{
     E57Reader, E57Writer, PointCloud as Scan, RawValues, Record, RecordDataType, RecordName, RecordValue,
 };
@@ -13,6 +15,9 @@ use super::{Format, ReadOptions, Reader, WriteOptions, check_finite};
 
 pub(super) const FORMAT: Format =
     Format { name: "E57", extensions: &["e57"], read: Reader::Cloud(read), write: Some(write) };
+
+/// Attributes of an XML element, and namespaces of all, that are more than any file needs.
+const MOST_ATTRIBUTES: usize = 1000;
 
 /// Largest departure of a pose's quaternion from unit length that is taken for rounding.
 const UNIT_TOLERANCE: f64 = 1e-3;
@@ -28,13 +33,15 @@ impl From<::e57::Error> for Fault {
 /// Points whose coordinates the file calls invalid are dropped. Colours are kept where every scan has them;
 /// the viewpoint is the pose of a file's only scan.
 fn read(input: &mut Input, _: &ReadOptions) -> Fallible<PointCloud> {
-    let len = input.len;
+    check_xml(input)?;
     let mut reader = E57Reader::new(&mut input.stream)?;
+    // Scans may claim the same bytes: what all of them claim together is held against the file.
+    let mut bits_left = u128::from(input.len.saturating_sub(reader.xml().len() as u64)) * 8;
     let scans = reader.pointclouds();
     let mut cloud = PointCloud::default();
     let mut colors = Some(Vec::new());
     for scan in &scans {
-        check_claim(scan, len)?;
+        bits_left = check_claim(scan, bits_left)?;
         let pose = pose(scan)?;
         let Layout { position, spherical, invalid, color } = Layout::of(scan)?;
         if color.is_none() {
@@ -156,8 +163,27 @@ fn pose(scan: &Scan) -> Fallible<Option<Rigid>> {
     Ok(Some(Rigid { rotation, translation: translation.into() }))
 }
 
-/// Fails where a scan claims more points than the file's bits can hold.
-fn check_claim(scan: &Scan, len: u64) -> Fallible<()> {
+/// Fails where the XML section would take its parser long, which holds each attribute of an element against all others, and
+/// hands each namespace down to every element.
+fn check_xml(input: &mut Input) -> Fallible<()> {
+    if !input.array::<8>().is_ok_and(|start| start == *b"ASTM-E57") {
+        return malformed("it does not start with `ASTM-E57`");
+    }
+    let xml = E57Reader::raw_xml(&mut input.stream)?;
+    input.stream.rewind()?;
+    // No `<` stands within an element's tag.
+    let has_many = |element: &[u8]| element.split(|&byte| byte == b'=').nth(MOST_ATTRIBUTES + 1).is_some();
+    if xml.split(|&byte| byte == b'<').any(has_many) {
+        return malformed(format!("an XML element has more than {MOST_ATTRIBUTES} attributes"));
+    }
+    if xml.windows(5).filter(|word| word == b"xmlns").count() > MOST_ATTRIBUTES {
+        return malformed(format!("the XML section has more than {MOST_ATTRIBUTES} namespaces"));
+    }
+    Ok(())
+}
+
+/// What the points of a scan leave of `bits_left`; fails where they claim more.
+fn check_claim(scan: &Scan, bits_left: u128) -> Fallible<u128> {
     let bits = |kind: &RecordDataType| match *kind {
         RecordDataType::Single { .. } => 32,
         RecordDataType::Double { .. } => 64,
@@ -165,13 +191,19 @@ fn check_claim(scan: &Scan, len: u64) -> Fallible<()> {
             u128::BITS - (i128::from(max) - i128::from(min)).unsigned_abs().leading_zeros()
         }
     };
-    let bits: u32 = scan.prototype.iter().map(|record| bits(&record.data_type)).sum();
-    // Without a bit a point, any number of points would fit.
-    if scan.records > 0 && (bits == 0 || u128::from(scan.records) * u128::from(bits) > u128::from(len) * 8) {
-        let records = scan.records;
-        return malformed(format!("a scan claims {records} points of {bits} bits, the file has {len} bytes"));
+    let (records, fields) = (scan.records, scan.prototype.len());
+    if records == 0 {
+        return Ok(bits_left);
     }
-    Ok(())
+    let bits: u128 = scan.prototype.iter().map(|record| u128::from(bits(&record.data_type))).sum();
+    // Without a bit a value, any number of values would fit.
+    if bits < fields as u128 {
+        return malformed(format!("a scan has points of {bits} bits for {fields} values"));
+    }
+    match bits_left.checked_sub(u128::from(records) * bits) {
+        Some(left) => Ok(left),
+        None => malformed(format!("a scan claims {records} points of {bits} bits, more than the file has")),
+    }
 }
 
 /// One scan without pose, coordinates as `f64`; normals and viewpoint are not kept.

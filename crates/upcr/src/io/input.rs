@@ -37,29 +37,34 @@ pub(super) fn unsupported<T>(reason: impl Into<String>) -> Fallible<T> {
 }
 
 /// Bytes with a position: an open file, or memory.
-pub(super) trait Stream: Read + Seek + Send + Sync {}
-impl<T: Read + Seek + Send + Sync> Stream for T {}
+pub(super) trait Stream: Read + Seek {}
+impl<T: Read + Seek> Stream for T {}
 
 /// Longest line that is taken for text; more means a binary file read as text.
 const LONGEST_LINE: u64 = 1 << 20;
 
+/// Points that any compressed file may hold, and more for each of its bytes: all alike, billions of them would fit into
+/// a megabyte. No measurement comes near.
+const MOST_POINTS: u64 = 1 << 23;
+const MOST_POINTS_A_BYTE: u64 = 8;
+
 /// Bytes of records read in one go.
 const CHUNK: usize = 1 << 20;
 
-/// An open file: buffered, of known length, with a count of its lines where it is text.
-pub(super) struct Input {
-    pub(super) stream: BufReader<Box<dyn Stream>>,
+/// An open file, or what stands for one: buffered, of known length, with a count of its lines where it is text.
+pub(super) struct Input<'a> {
+    pub(super) stream: BufReader<Box<dyn Stream + 'a>>,
     /// Length of the whole file in bytes.
     pub(super) len: u64,
     /// Number of the last line that was read, from 1.
     pub(super) line_number: usize,
 }
 
-impl Input {
-    pub(super) fn new(mut stream: impl Stream + 'static) -> io::Result<Self> {
+impl<'a> Input<'a> {
+    pub(super) fn new(mut stream: impl Stream + 'a) -> io::Result<Self> {
         let len = stream.seek(SeekFrom::End(0))?;
         stream.rewind()?;
-        let stream: Box<dyn Stream> = Box::new(stream);
+        let stream: Box<dyn Stream + 'a> = Box::new(stream);
         Ok(Self { stream: BufReader::with_capacity(1 << 16, stream), len, line_number: 0 })
     }
 
@@ -157,6 +162,14 @@ impl Input {
     pub(super) fn bad_line<T>(&self, reason: impl std::fmt::Display) -> Fallible<T> {
         malformed(format!("line {}: {reason}", self.line_number))
     }
+}
+
+/// Fails where a file of `len` bytes is too short for `count` compressed points that are not nearly all alike.
+pub(super) fn check_expansion(len: u64, count: u64) -> Fallible<()> {
+    if count > MOST_POINTS.saturating_add(len.saturating_mul(MOST_POINTS_A_BYTE)) {
+        return malformed(format!("{count} points are too many for a file of {len} bytes"));
+    }
+    Ok(())
 }
 
 /// The words of a text file one after the other, wherever its lines end.

@@ -1,7 +1,8 @@
 //! Reading and writing clouds, meshes and transforms: one small file per format.
 //!
-//! The format is told by the file's extension; `FORMATS` lists them all. Coordinates are kept in the
-//! file's own frame and unit. What a file claims is checked against its size before memory is allocated.
+//! The format is told by the file's extension; `FORMATS` lists them all. What is in memory is read and written by the
+//! functions that take a stream, under a name that stands for the path. Coordinates are kept in the file's own frame
+//! and unit. What a file claims is checked against its size before memory is allocated.
 
 mod columns;
 mod depth;
@@ -25,14 +26,15 @@ mod xyz;
 mod tests;
 
 use std::fs::File;
+use std::io::{Read, Seek, Write};
 use std::path::Path;
 
 use crate::{Error, PointCloud, Result, TriangleMesh};
 use input::{Fallible, Fault, Input, malformed, unsupported};
-use output::{Output, write_atomically};
+use output::{Output, write_atomically, write_buffered};
 
 pub use npy::write_array;
-pub use transform::{read_transform, write_transform};
+pub use transform::{read_transform, read_transform_from, write_transform};
 
 /// A file format: its name, its extensions, and what can be done with it.
 struct Format {
@@ -142,7 +144,32 @@ pub fn read_cloud(path: impl AsRef<Path>) -> Result<PointCloud> {
 /// # Errors
 /// As [`read_cloud`].
 pub fn read_cloud_with(path: impl AsRef<Path>, options: &ReadOptions) -> Result<PointCloud> {
-    read_file(path.as_ref(), |format, input| read_cloud_from(format, input, options))
+    let path = path.as_ref();
+    read_cloud_from(path, open_known(path)?, options)
+}
+
+/// Reads a cloud as [`read_cloud_with`] does, from memory or any stream. `name` stands for the path: its extension tells
+/// the format, and errors name it.
+///
+/// ```
+/// use std::io::Cursor;
+/// use upcr::io::{ReadOptions, read_cloud_from};
+///
+/// let cloud = read_cloud_from("scan.xyz", Cursor::new("1 2 3\n4 5 6\n"), &ReadOptions::default())?;
+/// assert_eq!(cloud.points, [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]);
+/// # Ok::<(), upcr::Error>(())
+/// ```
+///
+/// # Errors
+/// As [`read_cloud`].
+pub fn read_cloud_from(
+    name: impl AsRef<Path>,
+    stream: impl Read + Seek,
+    options: &ReadOptions,
+) -> Result<PointCloud> {
+    let name = name.as_ref();
+    let format = format_of(name)?;
+    take(name, format.name, stream, |input| cloud_of(format, input, options))
 }
 
 /// Reads a mesh: OFF, OBJ, STL, or the vertices and faces of a PLY. Polygons are cut into fans of triangles.
@@ -150,7 +177,18 @@ pub fn read_cloud_with(path: impl AsRef<Path>, options: &ReadOptions) -> Result<
 /// # Errors
 /// As [`read_cloud`]; [`Error::Unsupported`] where the format holds no mesh.
 pub fn read_mesh(path: impl AsRef<Path>) -> Result<TriangleMesh> {
-    read_file(path.as_ref(), read_mesh_from)
+    let path = path.as_ref();
+    read_mesh_from(path, open_known(path)?)
+}
+
+/// Reads a mesh as [`read_mesh`] does, from memory or any stream, named as for [`read_cloud_from`].
+///
+/// # Errors
+/// As [`read_mesh`].
+pub fn read_mesh_from(name: impl AsRef<Path>, stream: impl Read + Seek) -> Result<TriangleMesh> {
+    let name = name.as_ref();
+    let format = format_of(name)?;
+    take(name, format.name, stream, |input| mesh_of(format, input))
 }
 
 /// Writes a cloud with the default options, the format told by the file's extension.
@@ -171,6 +209,22 @@ pub fn write_cloud_with(path: impl AsRef<Path>, cloud: &PointCloud, options: &Wr
     let path = path.as_ref();
     let (format, write) = writer_of(path)?;
     write_atomically(path, |output| write(output, cloud, options)).map_err(|f| explain(path, format.name, f))
+}
+
+/// Writes a cloud as [`write_cloud_with`] does, to memory or any stream, named as for [`read_cloud_from`]. The stream is to
+/// be empty: what was there is neither cut off nor, where writing fails, brought back.
+///
+/// # Errors
+/// As [`write_cloud`].
+pub fn write_cloud_to(
+    name: impl AsRef<Path>,
+    stream: impl Read + Write + Seek + Send + Sync,
+    cloud: &PointCloud,
+    options: &WriteOptions,
+) -> Result<()> {
+    let name = name.as_ref();
+    let (format, write) = writer_of(name)?;
+    write_buffered(stream, |output| write(output, cloud, options)).map_err(|f| explain(name, format.name, f))
 }
 
 /// Whether `path`'s extension tells a format that can be written: to be asked before long work.
@@ -200,7 +254,7 @@ pub fn extensions() -> impl Iterator<Item = (&'static str, bool)> {
     FORMATS.iter().flat_map(|f| f.extensions.iter().map(|&e| (e, f.write.is_some())))
 }
 
-fn read_cloud_from(format: &Format, input: &mut Input, options: &ReadOptions) -> Fallible<PointCloud> {
+fn cloud_of(format: &Format, input: &mut Input, options: &ReadOptions) -> Fallible<PointCloud> {
     match format.read {
         Reader::Cloud(read) | Reader::CloudOrMesh(read, _) => read(input, options),
         Reader::Mesh(read) => {
@@ -213,7 +267,7 @@ fn read_cloud_from(format: &Format, input: &mut Input, options: &ReadOptions) ->
     }
 }
 
-fn read_mesh_from(format: &Format, input: &mut Input) -> Fallible<TriangleMesh> {
+fn mesh_of(format: &Format, input: &mut Input) -> Fallible<TriangleMesh> {
     match format.read {
         Reader::Mesh(read) | Reader::CloudOrMesh(_, read) => read(input),
         Reader::Cloud(_) => unsupported(format!("{} files hold no mesh", format.name)),
@@ -236,28 +290,32 @@ fn check_indices(mesh: &TriangleMesh) -> Fallible<()> {
     }
 }
 
-fn read_file<T>(path: &Path, read: impl FnOnce(&Format, &mut Input) -> Fallible<T>) -> Result<T> {
-    let format = format_of(path)?;
-    let mut input = open(path, format.name)?;
-    read(format, &mut input).map_err(|fault| explain(path, format.name, fault))
+/// Opens a file whose extension is to tell its format.
+fn open_known(path: &Path) -> Result<File> {
+    format_of(path)?;
+    open(path)
 }
 
-/// Opens a file that is to be of `format`.
-fn open(path: &Path, format: &'static str) -> Result<Input> {
+fn open(path: &Path) -> Result<File> {
     let open = || {
         let file = File::open(path)?;
-        if file.metadata()?.is_dir() {
-            return Err(std::io::ErrorKind::IsADirectory.into());
-        }
-        Input::new(file)
+        if file.metadata()?.is_dir() { Err(std::io::ErrorKind::IsADirectory.into()) } else { Ok(file) }
     };
-    match open() {
-        Ok(input) if input.len == 0 => {
-            Err(explain(path, format, Fault::Malformed("the file is empty".into())))
-        }
-        Ok(input) => Ok(input),
-        Err(source) => Err(Error::Io { path: path.to_owned(), source }),
-    }
+    open().map_err(|source| Error::Io { path: path.to_owned(), source })
+}
+
+/// Reads what is to be of `format` from `stream`, which errors call `name`.
+fn take<T>(
+    name: &Path,
+    format: &'static str,
+    stream: impl Read + Seek,
+    read: impl FnOnce(&mut Input) -> Fallible<T>,
+) -> Result<T> {
+    let take = || {
+        let mut input = Input::new(stream)?;
+        if input.len == 0 { malformed("the file is empty") } else { read(&mut input) }
+    };
+    take().map_err(|fault| explain(name, format, fault))
 }
 
 fn find_format(path: &Path) -> Option<&'static Format> {

@@ -1,14 +1,28 @@
 //! Files that are written whole or not at all.
 
 use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter, Read, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::input::Fallible;
 
+/// A new file, or memory. E57 reads back what it wrote; LAZ compresses on several threads.
+pub(super) trait Sink: Read + Write + Seek + Send + Sync {}
+impl<T: Read + Write + Seek + Send + Sync> Sink for T {}
+
 /// What the writers write to.
-pub(super) type Output = BufWriter<File>;
+pub(super) type Output<'a> = BufWriter<Box<dyn Sink + 'a>>;
+
+/// Hands a buffered `sink` to `write`.
+pub(super) fn write_buffered<'a>(
+    sink: impl Sink + 'a,
+    write: impl FnOnce(&mut Output<'a>) -> Fallible<()>,
+) -> Fallible<()> {
+    let mut output = Output::with_capacity(1 << 16, Box::new(sink));
+    write(&mut output)?;
+    Ok(output.flush()?)
+}
 
 /// A file under a temporary name, removed when dropped unless it was given its final name.
 struct Temporary {
@@ -28,16 +42,13 @@ impl Drop for Temporary {
 /// Writes `path` through `write`: into a new file beside it, then renamed over it.
 pub(super) fn write_atomically(path: &Path, write: impl FnOnce(&mut Output) -> Fallible<()>) -> Fallible<()> {
     let (mut temporary, file) = create_beside(path)?;
-    let mut output = BufWriter::with_capacity(1 << 16, file);
-    write(&mut output)?;
-    output.flush()?;
-    drop(output);
+    write_buffered(file, write)?;
     std::fs::rename(&temporary.path, path)?;
     temporary.kept = true;
     Ok(())
 }
 
-/// A new file in the folder of `path`, readable too since E57 reads back what it wrote.
+/// A new file in the folder of `path`.
 fn create_beside(path: &Path) -> io::Result<(Temporary, File)> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let name = path

@@ -184,8 +184,8 @@ fn layout(
         };
         // A record of more than this is nobody's, and would overflow what is computed from it.
         let count = counts[i];
-        if count > 1 << 20 {
-            return malformed(format!("field `{name}` has {count} values a point"));
+        if column.saturating_add(count) > 1 << 20 {
+            return malformed(format!("with field `{name}` a point has more than 2^20 values"));
         }
         // Without values a field is not there.
         let name = if count == 0 { String::new() } else { name };

@@ -47,15 +47,11 @@ fn format_for(extension: &str) -> &'static Format {
 
 fn cloud_from(extension: &str, bytes: &[u8]) -> Fallible<PointCloud> {
     let mut input = Input::new(Cursor::new(bytes.to_vec()))?;
-    read_cloud_from(
-        format_for(extension),
-        &mut input,
-        &ReadOptions { mesh_samples: 100, ..Default::default() },
-    )
+    cloud_of(format_for(extension), &mut input, &ReadOptions { mesh_samples: 100, ..Default::default() })
 }
 
 fn mesh_from(extension: &str, bytes: &[u8]) -> Fallible<TriangleMesh> {
-    read_mesh_from(format_for(extension), &mut Input::new(Cursor::new(bytes.to_vec()))?)
+    mesh_of(format_for(extension), &mut Input::new(Cursor::new(bytes.to_vec()))?)
 }
 
 fn written(extension: &str, cloud: &PointCloud, encoding: Encoding) -> Vec<u8> {
@@ -437,7 +433,7 @@ fn depth_images_become_points_before_the_camera() {
     let intrinsics = Some(Intrinsics { fx: 2.0, fy: 4.0, cx: 0.5, cy: 0.5 });
     let options = ReadOptions { intrinsics, ..Default::default() };
     let mut input = Input::new(Cursor::new(file.clone())).unwrap();
-    let cloud = read_cloud_from(format_for("png"), &mut input, &options).unwrap();
+    let cloud = cloud_of(format_for("png"), &mut input, &options).unwrap();
     assert_eq!(cloud.points, [[0.5, -0.25, 2.0], [0.125, 0.0625, 0.5]]);
     assert_eq!(cloud.viewpoint, Some([0.0; 3]));
     assert!(matches!(cloud_from("png", &file), Err(Fault::Unsupported(_))), "no camera for 2×2");
@@ -638,4 +634,43 @@ fn arbitrary_bytes_never_panic() {
             )
             .unwrap();
     }
+}
+
+#[test]
+fn memory_gives_what_a_file_gives() {
+    let cloud = rich_cloud(50);
+    for (extension, writable) in extensions() {
+        let name = format!("cloud.{extension}");
+        if !writable {
+            let file = write_cloud_to(&name, Cursor::new(Vec::new()), &cloud, &WriteOptions::default());
+            assert!(matches!(file, Err(Error::Unsupported { path, .. }) if path == Path::new(&name)));
+            continue;
+        }
+        let (_folder, path) = in_folder(&name);
+        write_cloud(&path, &cloud).unwrap();
+        let mut memory = Cursor::new(Vec::new());
+        write_cloud_to(&name, &mut memory, &cloud, &WriteOptions::default()).unwrap();
+        let bytes = memory.into_inner();
+        assert_eq!(bytes, std::fs::read(&path).unwrap(), "{name}");
+        let read = read_cloud_from(&name, Cursor::new(&bytes), &ReadOptions::default()).unwrap();
+        assert_eq!(read, read_cloud(&path).unwrap(), "{name}");
+    }
+    let mesh = read_mesh_from("square.off", Cursor::new(format!("OFF {SQUARE}")));
+    assert_eq!(mesh.unwrap().triangles, [[0, 1, 2], [0, 2, 3]]);
+    let pose = read_transform_from("T.txt", Cursor::new("1 0 0 5 0 1 0 6 0 0 1 7"));
+    assert_eq!(pose.unwrap(), Rigid::from_translation([5.0, 6.0, 7.0]));
+}
+
+#[test]
+fn memory_that_is_no_file_is_called_by_its_name() {
+    let from = |name: &str, bytes: &'static str| {
+        read_cloud_from(name, Cursor::new(bytes), &ReadOptions::default()).unwrap_err().to_string()
+    };
+    assert!(from("input.ply", "").contains("input.ply: not a valid PLY file: the file is empty"));
+    assert!(from("input.ply", "solid").contains("input.ply"));
+    assert!(from("input.doc", "1 2 3").contains("input.doc"));
+    let mesh = read_mesh_from("input.bin", Cursor::new([0; 16])).unwrap_err();
+    assert!(matches!(&mesh, Error::Unsupported { path, .. } if path == Path::new("input.bin")), "{mesh}");
+    let pose = read_transform_from("pose", Cursor::new("1 0 0")).unwrap_err();
+    assert!(matches!(&pose, Error::Malformed { path, .. } if path == Path::new("pose")), "{pose}");
 }

@@ -1,12 +1,12 @@
 //! Rigid motions as text: a 4×4 matrix, row after row.
 
-use std::io::Write;
+use std::io::{Read, Seek, Write};
 use std::path::Path;
 
 use crate::{Result, Rigid};
 
 use super::input::{Fallible, Input, malformed};
-use super::{explain, open, output::write_atomically};
+use super::{explain, open, output::write_atomically, take};
 
 const NAME: &str = "transform";
 
@@ -18,7 +18,15 @@ const NAME: &str = "transform";
 /// a rigid motion.
 pub fn read_transform(path: impl AsRef<Path>) -> Result<Rigid> {
     let path = path.as_ref();
-    open(path, NAME).and_then(|mut input| parse(&mut input).map_err(|fault| explain(path, NAME, fault)))
+    read_transform_from(path, open(path)?)
+}
+
+/// Reads a matrix as [`read_transform`] does, from memory or any stream; `name` stands for the path in errors.
+///
+/// # Errors
+/// As [`read_transform`].
+pub fn read_transform_from(name: impl AsRef<Path>, stream: impl Read + Seek) -> Result<Rigid> {
+    take(name.as_ref(), NAME, stream, parse)
 }
 
 /// Writes the 4×4 row-major matrix as text, every number so that it reads back the same.

@@ -76,7 +76,8 @@ impl Objective<'_> {
         let r = y - Vector3::from(c.target.map(f64::from));
         let m = pose.rotation * Vector3::from(c.source_normal.map(f64::from));
         let information = self.factor.information(c.target_normal.map(f64::from), m.into());
-        let squared = r.dot(&(times(&information, &r)));
+        // Along the plane of a plane's information rounding alone is left, of either sign.
+        let squared = r.dot(&(times(&information, &r))).max(0.0);
         Residual { y, r, information, squared }
     }
 
@@ -226,4 +227,30 @@ pub(crate) fn align(pairs: impl Iterator<Item = ([f32; 3], [f32; 3], f64)> + Clo
     }
     let rotation = nearest_rotation(&cross);
     Some(Rigid { rotation, translation: q_mean - rotation * p_mean })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::refine::{Refinement, factor};
+
+    #[test]
+    fn a_squared_residual_is_not_negative() {
+        let objective =
+            Objective { factor: factor(Refinement::Plane, false), kernel: RobustKernel::None, scale_sq: 1.0 };
+        for i in 0..1000u16 {
+            let [a, b] = [f32::from(i) * 0.37, f32::from(i) * 0.73];
+            let normal = [a.sin() * b.cos(), a.sin() * b.sin(), a.cos()];
+            // Along the plane, up to rounding.
+            let along = [a.cos() * b.cos(), a.cos() * b.sin(), -a.sin()];
+            let pair = Correspondence {
+                source: along,
+                target: [0.0; 3],
+                source_normal: normal,
+                target_normal: normal,
+            };
+            let squared = objective.squared(&Rigid::identity(), &pair);
+            assert!((0.0..1e-12).contains(&squared), "{squared}");
+        }
+    }
 }

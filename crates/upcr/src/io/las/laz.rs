@@ -10,7 +10,7 @@ use rayon::prelude::*;
 
 use crate::PointCloud;
 
-use super::super::input::{Fallible, Fault, Input, malformed, unsupported};
+use super::super::input::{Fallible, Fault, Input, check_expansion, malformed, unsupported};
 use super::super::output::Output;
 use super::header::{self, Header, RECORD_HEADER, padded};
 use super::{Points, for_each_batch};
@@ -24,6 +24,11 @@ impl From<::laz::LasZipError> for Fault {
     }
 }
 
+/// Chunks that any file may have, and bytes for each further one: to decode one costs a millisecond, however few its
+/// points.
+const MOST_CHUNKS: u64 = 256;
+const BYTES_A_CHUNK: u64 = 1024;
+
 /// Compressed bytes of some points that do not depend on others.
 struct Chunk {
     bytes: Vec<u8>,
@@ -35,6 +40,7 @@ pub(super) fn read(input: &mut Input, header: &Header) -> Fallible<Points> {
     let Some(description) = &header.laszip else { return malformed("nothing describes the compression") };
     let vlr = LazVlr::from_buffer(description)?;
     check_items(&vlr, header)?;
+    check_expansion(input.len, header.count)?;
     let compressor = u16::from_le_bytes([description[0], description[1]]);
     let mut sizes = if compressor == CompressorType::PointWise as u16 {
         vec![(input.remaining()?, header.count)]
@@ -91,6 +97,9 @@ fn chunk_sizes(input: &mut Input, header: &Header, vlr: &LazVlr) -> Fallible<Vec
     // Each holds at least one point, which is stored as it is.
     if chunks > header.count || chunks * u64::from(header.record_length) > room {
         return malformed(format!("the file claims {chunks} compressed chunks, more than fit in it"));
+    }
+    if chunks > MOST_CHUNKS + input.len / BYTES_A_CHUNK {
+        return malformed(format!("{chunks} compressed chunks are too many for {} bytes", input.len));
     }
     input.stream.seek(SeekFrom::Start(start))?;
     let table = ChunkTable::read_from(&mut input.stream, vlr)?;
