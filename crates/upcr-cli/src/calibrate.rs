@@ -136,7 +136,7 @@ fn run_fit(args: &Fit) -> Result<ExitCode> {
         sources.join(", "),
         args.seed
     );
-    let calibration = fit(&observed, about);
+    let calibration = fit(&observed, Calibration::embedded()?.as_ref(), about);
     let mut text = serde_json::to_string_pretty(&calibration)?;
     text.push('\n');
     write_atomically(&args.out, text.as_bytes())?;

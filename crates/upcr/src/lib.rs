@@ -23,7 +23,7 @@ pub use register::register;
 pub use registration::{Alternative, Reason, Registration, TRUSTWORTHY, Timings};
 pub use settings::{Method, Settings};
 pub use transform::Rigid;
-pub use verify::{Calibration, Evidence, FEATURES};
+pub use verify::{Calibration, Evidence, FEATURES, Weights};
 
 #[cfg(doctest)]
 #[doc = include_str!("../../../README.md")]

@@ -26,7 +26,7 @@ use crate::{
 const COARSE_CANDIDATES: usize = 8;
 const FINE_CANDIDATES: usize = 3;
 /// Different poses that score at least this share of the best are as good an answer; so many of them are told.
-const RIVALLING: f64 = 0.95;
+const RIVALLING: f64 = 0.92;
 const RIVALS: usize = 8;
 /// A hypothesis that scores less than this share of the best is not looked at further.
 const PROMISING: f64 = 0.7;
@@ -193,8 +193,10 @@ impl<'a> Pipeline<'a> {
             let registration = self.verified();
             self.timings.verify += milliseconds(start);
             let sure = registration.probability >= source.sure();
+            // What two sources find ambiguous alike is.
+            let settled = registration.evidence.rivals > 0 && self.sources_agree();
             best = Some(Registration { timings_ms: self.timings, ..registration });
-            if sure {
+            if sure || settled {
                 break;
             }
         }
@@ -368,6 +370,7 @@ impl<'a> Pipeline<'a> {
             matches: (!self.matches.is_empty()).then(|| [explained(&self.matches), self.matches.len()]),
             conditioning: conditioning(&best.refined.shape_hessian, radius),
             converged: best.refined.converged || self.settings.refine == Refinement::None,
+            samples: source.sparse && target.sparse,
             ..Evidence::none(source.points.len().min(target.points.len()))
         };
         let evidence = seen([&forward, &backward], limit, evidence);
@@ -395,15 +398,23 @@ impl<'a> Pipeline<'a> {
         }
     }
 
+    /// Whether two poses, finely refined, are one answer.
+    fn same(&self, a: &Candidate, b: &Candidate) -> bool {
+        let radius = f64::from(self.source.fine.radius);
+        separation(&a.refined.pose, &b.refined.pose, radius) <= DISTINCT_VOXELS * self.voxel_size
+    }
+
+    /// Whether another source of hypotheses came to the best pose too.
+    fn sources_agree(&self) -> bool {
+        let Some(best) = self.candidates.first() else { return false };
+        self.candidates.iter().any(|c| c.method != best.method && self.same(c, best))
+    }
+
     /// Candidates that are clearly different from `best` and from each other, best first.
     fn others(&self, best: &Candidate) -> Vec<&Candidate> {
-        let radius = f64::from(self.source.fine.radius);
-        let same = |a: &Candidate, b: &Candidate| {
-            separation(&a.refined.pose, &b.refined.pose, radius) <= DISTINCT_VOXELS * self.voxel_size
-        };
         let mut others: Vec<&Candidate> = Vec::new();
         for candidate in &self.candidates {
-            if !same(candidate, best) && others.iter().all(|other| !same(candidate, other)) {
+            if !self.same(candidate, best) && others.iter().all(|other| !self.same(candidate, other)) {
                 others.push(candidate);
             }
         }

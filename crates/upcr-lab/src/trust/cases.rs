@@ -10,7 +10,7 @@ use serde::Serialize;
 use upcr::neighbors::KdTree;
 use upcr::{Error, PointCloud, Result, Rigid, io};
 
-use crate::data::scanner::{Optics, Scene, SynthSettings, synth};
+use crate::data::scanner::{Optics, Scan, Scene, SynthSettings, synth};
 use crate::data::seven_scenes::Frame;
 use crate::data::{self, Shapes, Split, seven_scenes};
 use crate::eval::metrics::{Tolerance, diameter};
@@ -469,6 +469,13 @@ fn virtual_place(rng: &mut impl Rng) -> Result<Place> {
         settings.sensor.noise.quadratic_per_m = rng.random_range(0.0005..0.005);
         settings.sensor.range_m[1] = rng.random_range(3.5..8.0);
     }
-    let scans = synth(&settings)?.into_iter().map(|scan| (scan.cloud, scan.T_world_sensor)).collect();
+    // Built-in scenes are of one size each; things in the world are not.
+    let size: f64 = rng.random_range(0.7..1.4);
+    let resized = |scan: Scan| {
+        let points = scan.cloud.points.iter().map(|p| p.map(|v| size * v)).collect();
+        let pose = Rigid { translation: scan.T_world_sensor.translation * size, ..scan.T_world_sensor };
+        (PointCloud::from_points(points), pose)
+    };
+    let scans = synth(&settings)?.into_iter().map(resized).collect();
     Ok(Place { scans, tolerance, warp })
 }

@@ -1,19 +1,30 @@
 //! Logistic regression of right and wrong over the evidence.
 
 use nalgebra::{DMatrix, DVector, SVector};
-use upcr::{Calibration, FEATURES};
+use upcr::{Calibration, FEATURES, Weights};
 
 use super::observe::Observed;
 
 const COUNT: usize = FEATURES.len();
 /// Ridge on the weights of standardised features: keeps them finite where a feature tells right from wrong alone.
 const RIDGE: f64 = 0.1;
+/// Pairs without which nothing is fitted.
+const FEWEST: usize = 100;
 /// Newton steps at most, and the largest change of a weight that counts as settled.
 const STEPS: usize = 50;
 const SETTLED: f64 = 1e-9;
 
-/// The weights under which what was seen of the poses is most probable, given which of them were right.
-pub fn fit(observed: &[Observed], about: String) -> Calibration {
+/// The calibration under which what was seen of the poses is most probable, given which of them were right. Of clouds
+/// whose like was hardly seen the weights stay those of `default`.
+pub fn fit(observed: &[Observed], default: &Calibration, about: String) -> Calibration {
+    let of = |samples: bool, default: &Weights| {
+        let seen: Vec<&Observed> = observed.iter().filter(|o| o.evidence.samples == samples).collect();
+        if seen.len() < FEWEST { default.clone() } else { weights(&seen) }
+    };
+    Calibration { about, samples: of(true, &default.samples), averages: of(false, &default.averages) }
+}
+
+fn weights(observed: &[&Observed]) -> Weights {
     let rows: Vec<SVector<f64, COUNT>> = observed.iter().map(|o| o.evidence.features().into()).collect();
     let n = rows.len().max(1) as f64;
     let mean = rows.iter().sum::<SVector<f64, COUNT>>() / n;
@@ -46,7 +57,7 @@ pub fn fit(observed: &[Observed], about: String) -> Calibration {
     }
     let plain: [f64; COUNT] = std::array::from_fn(|k| weights[k + 1] * scale[k]);
     let shift: f64 = plain.iter().zip(mean.iter()).map(|(w, m)| w * m).sum();
-    Calibration::new(about, weights[0] - shift, plain)
+    Weights::new(weights[0] - shift, plain)
 }
 
 #[cfg(test)]
@@ -76,19 +87,19 @@ mod tests {
     fn the_law_that_draws_right_and_wrong_is_found() {
         let drawn = drawn(4000);
         let observed: Vec<Observed> = drawn.iter().map(|(o, _)| o.clone()).collect();
-        let calibration = fit(&observed, "test".into());
+        let calibration = fit(&observed, &Calibration::embedded().unwrap(), "test".into());
         let off =
             drawn.iter().map(|(o, p)| (calibration.probability(&o.evidence) - p).abs()).fold(0.0, f64::max);
         assert!(off < 0.08, "{off}");
         // Features that were alike in all pairs weigh nothing.
-        assert_eq!(calibration.weights["no_matches"], 0.0);
+        assert_eq!(calibration.samples.of["no_matches"], 0.0);
     }
 
     #[test]
     fn where_all_poses_are_right_the_probability_is_high_and_finite() {
         let observed: Vec<Observed> =
             drawn(200).into_iter().map(|(o, _)| Observed { right: true, ..o }).collect();
-        let calibration = fit(&observed, "test".into());
+        let calibration = fit(&observed, &Calibration::embedded().unwrap(), "test".into());
         let p = calibration.probability(&observed[0].evidence);
         assert!(p > 0.9 && p <= 1.0, "{p}");
     }

@@ -1,4 +1,4 @@
-//! The probability that a pose is right: a logistic regression over the evidence, in a file that can be read.
+//! The probability that a pose is right: logistic regressions over the evidence, in a file that can be read.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -62,16 +62,50 @@ impl Evidence {
     }
 }
 
-/// Weights of the evidence: the logit of the probability is the intercept plus the weighted sum of [`FEATURES`].
+/// What the evidence weighs, where points are samples as they were taken and where they are averages of many: the one
+/// keeps clouds of one surface apart by their spacing, the other by noise alone.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Calibration {
     /// What counted as right where the weights were fitted, and on how much of what; for readers.
     pub about: String,
+    /// Where points are samples.
+    pub samples: Weights,
+    /// Where they are averages.
+    pub averages: Weights,
+}
+
+/// A logistic regression: the logit of the probability is the intercept plus the weighted sum of [`FEATURES`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Weights {
     /// The logit where all features are zero.
     pub intercept: f64,
     /// A weight for each of [`FEATURES`], by name.
-    pub weights: BTreeMap<String, f64>,
+    pub of: BTreeMap<String, f64>,
+}
+
+impl Weights {
+    /// From an intercept and weights in the order of [`FEATURES`].
+    pub fn new(intercept: f64, of: [f64; FEATURES.len()]) -> Self {
+        Self { intercept, of: FEATURES.iter().map(|name| (*name).to_owned()).zip(of).collect() }
+    }
+
+    fn probability(&self, features: &[f64; FEATURES.len()]) -> f64 {
+        let weight = |name: &str| self.of.get(name).copied().unwrap_or(0.0);
+        let weighted: f64 = FEATURES.iter().zip(features).map(|(name, value)| weight(name) * value).sum();
+        1.0 / (1.0 + (-self.intercept - weighted).exp())
+    }
+
+    fn check(&self) -> std::result::Result<(), String> {
+        if self.of.len() != FEATURES.len() || !FEATURES.iter().all(|name| self.of.contains_key(*name)) {
+            return Err(format!("its weights are not those of {}", FEATURES.join(", ")));
+        }
+        if !self.intercept.is_finite() || self.of.values().any(|weight| !weight.is_finite()) {
+            return Err("a weight is not finite".into());
+        }
+        Ok(())
+    }
 }
 
 impl Calibration {
@@ -100,28 +134,16 @@ impl Calibration {
         })
     }
 
-    /// From weights in the order of [`FEATURES`].
-    pub fn new(about: String, intercept: f64, weights: [f64; FEATURES.len()]) -> Self {
-        let weights = FEATURES.iter().map(|name| (*name).to_owned()).zip(weights).collect();
-        Self { about, intercept, weights }
-    }
-
     /// The probability that a pose is right of which this is known, 0 to 1.
     pub fn probability(&self, evidence: &Evidence) -> f64 {
-        let weighted =
-            self.weights.iter().zip(evidence.features()).map(|((_, weight), value)| weight * value);
-        let logit = self.intercept + weighted.sum::<f64>();
-        1.0 / (1.0 + (-logit).exp())
+        let weights = if evidence.samples { &self.samples } else { &self.averages };
+        weights.probability(&evidence.features())
     }
 
     fn parse(text: &str) -> std::result::Result<Self, String> {
         let found: Self = serde_json::from_str(text).map_err(|error| error.to_string())?;
-        if found.weights.len() != FEATURES.len() || !FEATURES.iter().all(|f| found.weights.contains_key(*f)) {
-            return Err(format!("its weights are not those of {}", FEATURES.join(", ")));
-        }
-        if !found.intercept.is_finite() || found.weights.values().any(|weight| !weight.is_finite()) {
-            return Err("a weight is not finite".into());
-        }
+        found.samples.check()?;
+        found.averages.check()?;
         Ok(found)
     }
 }

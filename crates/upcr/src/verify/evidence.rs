@@ -46,6 +46,8 @@ pub struct Evidence {
     pub converged: bool,
     /// Points of the smaller cloud.
     pub points: usize,
+    /// Whether the points are samples as they were taken, not averages of many.
+    pub samples: bool,
 }
 
 impl Evidence {
@@ -66,6 +68,7 @@ impl Evidence {
             conditioning: 0.0,
             converged: true,
             points,
+            samples: true,
         }
     }
 }

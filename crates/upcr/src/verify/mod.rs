@@ -7,7 +7,7 @@ mod overlap;
 mod scale;
 mod verdict;
 
-pub use calibration::{Calibration, FEATURES};
+pub use calibration::{Calibration, FEATURES, Weights};
 pub(crate) use conditioning::{conditioning, covariance};
 pub use evidence::Evidence;
 pub(crate) use evidence::{meeting, seen};

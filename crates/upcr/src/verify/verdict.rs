@@ -84,6 +84,7 @@ mod tests {
         conditioning: 0.02,
         converged: true,
         points: 5000,
+        samples: false,
     };
 
     fn verdict_on(evidence: &Evidence) -> Verdict {
