@@ -3,9 +3,9 @@
 use crate::{Error, Result};
 
 /// Bytes that a registration needs whatever the clouds' sizes: features, matches, the network and its passes.
-const FIXED: u64 = 64 << 20;
+const FIXED: u64 = 12 << 20;
 /// Bytes an occupied cell of the finest grid: the grid while it grows, or it and the level that is made of it.
-const PER_CELL: u64 = 400;
+const PER_CELL: u64 = 336;
 /// Fewer points of a cloud are not worth registering.
 const FEWEST_POINTS: usize = 2000;
 
