@@ -44,6 +44,8 @@ const FINE_POINTS: usize = 6000;
 const SCORING_SCALES: u32 = 4;
 /// Poses closer than this many voxels at the source's rim are one answer.
 const DISTINCT_VOXELS: f64 = 6.0;
+/// Held-out points that are looked at although the time is up: they take a few milliseconds.
+const QUICKLY_SEEN: usize = 16_384;
 /// Points of the source that tell its size where nothing else is known.
 const GLANCED_POINTS: usize = 1024;
 /// Probability, at most, of a pose that was not refined to the end, or not compared with all that was to stand beside it.
@@ -416,7 +418,7 @@ impl<'a> Pipeline<'a> {
         let (source, target) = (&self.source.fine, &self.target.fine);
         let limit = self.voxel_size as f32;
         let seen = |cloud: &Prepared| match cloud.held_out_points() {
-            all if all.len() > SCORING_POINTS && self.call.is_over() => Level::thin(&all, SCORING_POINTS),
+            all if all.len() > QUICKLY_SEEN && self.call.is_over() => Level::thin(&all, QUICKLY_SEEN),
             all => all,
         };
         let forward = distances(source, &seen(self.source), target, pose, limit);

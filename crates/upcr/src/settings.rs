@@ -62,7 +62,8 @@ pub struct Settings {
     pub seed: u64,
     /// Threads to use; `None`: all that the current rayon pool has. The result does not depend on it.
     pub threads: Option<NonZeroUsize>,
-    /// Seconds from the call on after which it ends, with the best pose so far; `None`: as many as it takes.
+    /// Seconds from the call on after which it ends, with the best pose so far; `None`: as many as it takes. Calls that
+    /// share a rayon pool may wait for each other's steps.
     pub max_seconds: Option<f64>,
     /// Bytes that the call may take beyond its input clouds and a network of one's own; `None`: as many as it takes.
     /// Where a cloud needs more, only every so-many-th point of it is used ([`crate::Registration::points_used`]).
