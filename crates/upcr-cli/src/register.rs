@@ -6,20 +6,24 @@ use std::io::{BufRead, BufReader, stdin};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result, bail};
-use clap::ValueEnum;
+use clap::{ArgGroup, ValueEnum};
 use serde::Serialize;
+use serde_json::Value;
 use upcr::features::MatchedFeature;
 use upcr::net::Network;
-use upcr::{Calibration, Locks, Method, Refinement, Registration, RobustKernel, Settings, io};
+use upcr::{
+    Calibration, Locks, Method, PointCloud, Refinement, Registration, RobustKernel, Settings, Watch, io,
+};
 
 use crate::output::{self, Progress};
 use crate::{NOT_REGISTERED, describe, input};
 
 /// Find the pose that lays SOURCE on TARGET
 #[derive(clap::Args)]
+#[command(group = ArgGroup::new("structured").args(["json", "pairs"]).multiple(true))]
 pub struct Args {
     /// The cloud that is moved
     #[arg(required_unless_present = "pairs")]
@@ -67,6 +71,14 @@ pub struct Args {
     /// Threads to use; the result does not depend on it [default: all]
     #[arg(long)]
     threads: Option<NonZeroUsize>,
+    /// Seconds after which a registration ends with the best pose so far; reading files is not counted [default: no limit]
+    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
+    max_seconds: Option<f64>,
+    /// Memory that a registration may take, e.g. `512M` or `2G` (K, M and G are powers of 1024). Where a cloud needs more,
+    /// every second, fourth, ... point of it is used. The clouds themselves, as the files' readers hold them, and the
+    /// weights of `--weights` are not counted [default: no limit]
+    #[arg(long, value_name = "BYTES", value_parser = bytes)]
+    max_memory: Option<u64>,
     /// Write the source, moved onto the target
     #[arg(short, long, value_name = "CLOUD")]
     output: Option<PathBuf>,
@@ -76,6 +88,10 @@ pub struct Args {
     /// Print one JSON object instead of a summary
     #[arg(long)]
     json: bool,
+    /// Leave the times and the number of threads out of the JSON: equal answers are then equal bytes, however many threads
+    /// found them (where no time limit ends the search)
+    #[arg(long, requires = "structured")]
+    no_times: bool,
     #[command(flatten)]
     reading: input::Reading,
 }
@@ -117,8 +133,34 @@ impl Args {
             calibration: self.calibration.as_deref().map(Calibration::load).transpose()?.map(Arc::new),
             seed: self.seed,
             threads: self.threads,
+            max_seconds: self.max_seconds,
+            max_memory_bytes: self.max_memory,
         })
     }
+
+    /// What is told of an answer.
+    fn told<'a, T: Serialize>(&self, answer: &'a T) -> Result<Told<'a, T>> {
+        if !self.no_times {
+            return Ok(Told::All(answer));
+        }
+        let mut value = serde_json::to_value(answer)?;
+        if let Some(fields) = value.as_object_mut() {
+            fields.remove("timings_ms");
+            if let Some(settings) = fields.get_mut("settings").and_then(Value::as_object_mut) {
+                settings.remove("threads");
+            }
+        }
+        Ok(Told::WithoutTimes(value))
+    }
+}
+
+/// A number of bytes, such as 2000000, 512M or 2G.
+fn bytes(text: &str) -> Result<u64> {
+    const UNITS: [(char, u32); 4] = [('K', 10), ('M', 20), ('G', 30), ('T', 40)];
+    let unit = UNITS.iter().find(|(unit, _)| text.ends_with([*unit, unit.to_ascii_lowercase()]));
+    let (digits, shift) = unit.map_or((text, 0), |&(_, shift)| (&text[..text.len() - 1], shift));
+    let number: u64 = digits.parse().context("a whole number, with K, M, G or T behind it, is needed")?;
+    number.checked_mul(1 << shift).context("more than there is")
 }
 
 pub fn run(args: &Args) -> Result<ExitCode> {
@@ -144,8 +186,7 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<ExitCo
     progress.step("reading");
     let source = args.reading.read(source_path)?;
     let target = args.reading.read(target_path)?;
-    progress.step("registering");
-    let found = upcr::register(&source, &target, &settings)
+    let found = register(&source, &target, &settings, &mut progress)
         .map_err(|error| input::name_file(error, source_path, target_path))?;
     progress.step("writing");
     if let Some(path) = &args.transform {
@@ -161,11 +202,19 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<ExitCo
         output::note(&format!("warning: {}: written with a pose that is not trustworthy", path.display()));
     }
     if args.json {
-        output::answer_json(&found)?;
+        output::answer_json(&args.told(&found)?)?;
     } else {
         output::answer(&summary(&found, args, source_path, target_path))?;
     }
     Ok(if trusted { ExitCode::SUCCESS } else { ExitCode::from(NOT_REGISTERED) })
+}
+
+/// An answer as JSON.
+#[derive(Serialize)]
+#[serde(untagged)]
+enum Told<'a, T> {
+    All(&'a T),
+    WithoutTimes(Value),
 }
 
 /// One line of the answer to a list of pairs.
@@ -209,13 +258,30 @@ fn run_pairs(args: &Args, list: &Path) -> Result<ExitCode> {
             Ok(found) => (Some(found), None),
             Err(error) => (None, Some(describe(&error))),
         };
-        output::answer_json_line(&PairAnswer { source, target, found, error })?;
+        output::answer_json_line(&args.told(&PairAnswer { source, target, found, error })?)?;
     }
     Ok(match (failed, untrusted) {
         (true, _) => ExitCode::FAILURE,
         (false, true) => ExitCode::from(NOT_REGISTERED),
         (false, false) => ExitCode::SUCCESS,
     })
+}
+
+/// Registers two clouds, each step shown.
+fn register(
+    source: &PointCloud,
+    target: &PointCloud,
+    settings: &Settings,
+    progress: &mut Progress,
+) -> upcr::Result<Registration> {
+    let progress = Mutex::new(progress);
+    let show = |at: upcr::Progress| {
+        let method = at.method.and_then(|m| m.to_possible_value());
+        let method = method.map_or_else(String::new, |m| format!(" ({})", m.get_name()));
+        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+        progress.step(&format!("{}{method}, {:.0} %", at.stage, 100.0 * at.done));
+    };
+    upcr::register_watched(source, target, settings, &Watch { progress: Some(&show), ..Watch::default() })
 }
 
 fn register_pair(
@@ -287,7 +353,15 @@ fn summary(found: &Registration, args: &Args, source: &Path, target: &Path) -> S
         if found.converged { "converged" } else { "not converged" },
         found.iterations
     );
-    let from = if args.voxel_size.is_some() { "given" } else { "derived from the clouds" };
+    if found.settings.max_memory_bytes.is_some() {
+        let [source, target] = found.points_used;
+        let _ = writeln!(text, "points       {source} of the source and {target} of the target used");
+    }
+    let from = match (args.voxel_size, found.voxel_size) {
+        (Some(_), _) => "given",
+        (None, 0.0) => "not derived in time",
+        (None, _) => "derived from the clouds",
+    };
     let _ = writeln!(text, "voxel size   {:.6} ({from})", found.voxel_size);
     let ms = &found.timings_ms;
     let _ = writeln!(

@@ -96,6 +96,14 @@ pub enum Error {
         /// What is wrong, and with which tensor.
         reason: String,
     },
+    /// The memory that a registration may take does not suffice for any part of its clouds that is worth registering.
+    #[error("a registration of these clouds needs at least {needed} bytes, where {given} are allowed")]
+    TooLittleMemory {
+        /// Bytes that it may take.
+        given: u64,
+        /// Bytes from which on it runs.
+        needed: u64,
+    },
     /// A setting is out of its range, or two settings contradict each other.
     #[error("setting `{name}`: {reason}")]
     InvalidSetting {

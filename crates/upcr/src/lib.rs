@@ -5,6 +5,7 @@ pub mod error;
 pub mod features;
 mod hypothesis;
 pub mod io;
+mod memory;
 pub mod neighbors;
 pub mod net;
 mod prepare;
@@ -15,15 +16,17 @@ mod settings;
 mod threads;
 pub mod transform;
 mod verify;
+mod watch;
 
 pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
 pub use refine::{Locks, Refinement, RobustKernel};
-pub use register::register;
+pub use register::{register, register_watched};
 pub use registration::{Alternative, Reason, Registration, TRUSTWORTHY, Timings};
 pub use settings::{Method, Settings};
 pub use transform::Rigid;
 pub use verify::{Calibration, Evidence, FEATURES, Weights};
+pub use watch::{Progress, Stage, Watch};
 
 #[cfg(doctest)]
 #[doc = include_str!("../../../README.md")]

@@ -5,12 +5,13 @@ use std::borrow::Cow;
 use rayon::prelude::*;
 
 use crate::{
-    CloudRole, Error, PointCloud, Result,
+    CloudRole, Error, PointCloud,
     cloud::{
-        Bounds, nearest_planes, plane_normal,
+        Bounds, fit_plane, local, nearest_planes, plane_normal,
         voxel::{Cell, VoxelGrid, count_occupied, smallest_voxel_size},
     },
     neighbors::{KdTree, Neighborhoods},
+    watch::{Call, IsOver, Stop},
 };
 
 /// Points that carry features: enough to describe a room, few enough to match in milliseconds.
@@ -52,6 +53,31 @@ pub(crate) struct Checked<'a> {
     pub cloud: &'a PointCloud,
     pub bounds: Bounds,
     role: CloudRole,
+    /// Every so-many-th point is used.
+    step: usize,
+}
+
+impl Checked<'_> {
+    /// The points that are used.
+    fn points(&self) -> impl ExactSizeIterator<Item = [f64; 3]> {
+        self.cloud.points.iter().step_by(self.step).copied()
+    }
+
+    /// The same, about the local origin.
+    fn local_points(&self) -> Vec<[f32; 3]> {
+        let origin = self.bounds.center();
+        self.points().map(|p| local(p, origin)).collect()
+    }
+
+    /// How many they are.
+    pub fn len(&self) -> usize {
+        self.cloud.len().div_ceil(self.step)
+    }
+
+    /// Uses half as many from now on.
+    pub fn thin(&mut self) {
+        self.step *= 2;
+    }
 }
 
 /// A cloud at one resolution, about its local origin.
@@ -75,6 +101,8 @@ pub(crate) struct Prepared {
     pub origin: [f64; 3],
     /// Length of the bounding box's diagonal.
     pub diagonal: f32,
+    /// Points of the cloud that were looked at.
+    pub points_used: usize,
     /// Resolution of refinement and verification.
     pub fine: Level,
     /// Resolution of the features, where it differs from `fine` and features are wanted.
@@ -109,21 +137,22 @@ fn is_held_out(index: u32) -> bool {
 }
 
 /// Checks that `cloud` is finite, large enough and more than a line.
-pub(crate) fn check(cloud: &PointCloud, role: CloudRole) -> Result<Checked<'_>> {
-    let bounds = cloud.checked_bounds(role)?;
+pub(crate) fn check<'a>(cloud: &'a PointCloud, role: CloudRole, call: &Call) -> Result<Checked<'a>, Stop> {
+    let bounds = cloud.checked_bounds_while(role, || call.go_on())?;
     let (Some(bounds), FEWEST_POINTS..) = (bounds, cloud.len()) else {
-        return Err(Error::TooFewPoints { role, found: cloud.len(), needed: FEWEST_POINTS });
+        return Err(Error::TooFewPoints { role, found: cloud.len(), needed: FEWEST_POINTS }.into());
     };
+    let degenerate = |reason| Err(Error::Degenerate { role, reason }.into());
     if bounds.diagonal() == 0.0 {
-        return Err(Error::Degenerate { role, reason: "all points are equal" });
+        return degenerate("all points are equal");
     }
     if !bounds.diagonal().is_finite() || bounds.diagonal() > f64::from(f32::MAX).sqrt() {
-        return Err(Error::Degenerate { role, reason: "the coordinates are too far apart to compute with" });
+        return degenerate("the coordinates are too far apart to compute with");
     }
     if is_collinear(cloud, &bounds) {
-        return Err(Error::Degenerate { role, reason: "all points lie on one line" });
+        return degenerate("all points lie on one line");
     }
-    Ok(Checked { cloud, bounds, role })
+    Ok(Checked { cloud, bounds, role, step: 1 })
 }
 
 /// Whether no point leaves the line through the first point and the one most distant from it.
@@ -161,13 +190,12 @@ pub(crate) fn derive_voxel_size(source: &Checked, target: &Checked) -> f64 {
 }
 
 fn natural_voxel_size(checked: &Checked) -> f64 {
-    let (points, bounds) = (&checked.cloud.points, &checked.bounds);
+    let (points, bounds) = (checked.len(), &checked.bounds);
     let floor = smallest_voxel_size(bounds.diagonal());
-    if points.len() <= FEATURE_POINTS {
+    if points <= FEATURE_POINTS {
         return spacing(checked).max(floor);
     }
-    let step = points.len().div_ceil(SCALE_SAMPLE);
-    let sample: Vec<_> = points.iter().step_by(step).copied().collect();
+    let sample: Vec<_> = checked.points().step_by(points.div_ceil(SCALE_SAMPLE)).collect();
     // Scans are surfaces: the number of occupied cells falls with the square of their size.
     let mut coarse = bounds.diagonal() / 64.0;
     let mut occupied = 0;
@@ -179,14 +207,14 @@ fn natural_voxel_size(checked: &Checked) -> f64 {
         }
         coarse *= ratio.sqrt();
     }
-    let spacing = coarse / (points.len() as f64 / occupied as f64).sqrt();
+    let spacing = coarse / (points as f64 / occupied as f64).sqrt();
     (0.5 * coarse).max(spacing).max(floor)
 }
 
 /// Typical distance between neighbouring samples, as the edge of the square that each would have to itself.
 fn spacing(checked: &Checked) -> f64 {
     const NEIGHBORS: usize = 9;
-    let points = checked.cloud.local_points(checked.bounds.center());
+    let points = checked.local_points();
     let tree = KdTree::new(&points);
     let step = points.len().div_ceil(SPACING_SAMPLE);
     let mut found = Vec::new();
@@ -208,9 +236,16 @@ fn spacing(checked: &Checked) -> f64 {
     f64::from(*edges.select_nth_unstable_by(middle, f32::total_cmp).1)
 }
 
-/// Downsamples to `voxel_size` and, where features are wanted, to the resolution that carries them.
-pub(crate) fn prepare(checked: &Checked, voxel_size: f64, described: Described) -> Result<Prepared> {
-    let (cloud, bounds) = (checked.cloud, &checked.bounds);
+/// Downsamples to `voxel_size`, to `most` points at most, and, where features are wanted, to the resolution that carries
+/// them.
+pub(crate) fn prepare(
+    checked: &Checked,
+    voxel_size: f64,
+    described: Described,
+    most: usize,
+    call: &Call,
+) -> Result<Prepared, Stop> {
+    let (bounds, points_used) = (&checked.bounds, checked.len());
     if voxel_size < smallest_voxel_size(bounds.diagonal()) {
         return Err(Error::InvalidSetting {
             name: "voxel_size",
@@ -219,70 +254,77 @@ pub(crate) fn prepare(checked: &Checked, voxel_size: f64, described: Described) 
                 checked.role,
                 bounds.diagonal()
             ),
-        });
+        }
+        .into());
     }
+    let go_on = || call.go_on();
     let origin = bounds.center();
     let diagonal = bounds.diagonal() as f32;
     let corner = std::array::from_fn(|k| bounds.min[k] - origin[k]);
-    let mut grid = VoxelGrid::new(cloud.points.iter().copied(), origin, corner, voxel_size);
-    if cloud.len() <= FEATURE_POINTS && grid.cells.len() * 10 >= cloud.len() * 4 {
+    let grid = VoxelGrid::new(checked.points(), origin, corner, voxel_size, most, go_on)?;
+    let mut grid = grid.ok_or(Stop::Full)?;
+    if points_used <= FEATURE_POINTS && grid.cells.len() * 10 >= points_used * 4 {
         // The scale is the cloud's own spacing: keep the samples themselves.
-        let points = cloud.local_points(origin);
-        return Ok(Prepared {
-            origin,
-            diagonal,
-            fine: Level::sparse(points, voxel_size, described),
-            coarse: None,
-        });
+        let fine = Level::sparse(checked.local_points(), voxel_size, described, call)?;
+        return Ok(Prepared { origin, diagonal, points_used, fine, coarse: None });
     }
     let separate = described != Described::Never && grid.cells.len() > FEATURE_POINTS;
-    let fine = Level::from_grid(&grid, voxel_size, if separate { Described::Never } else { described });
+    let fine_described = if separate { Described::Never } else { described };
+    let fine = Level::from_grid(&grid, voxel_size, fine_described, call)?;
     let mut coarse = None;
     if separate {
         let mut size = voxel_size;
         while size == voxel_size || grid.cells.len() > MAX_FEATURE_POINTS {
-            grid = grid.coarsened();
+            grid = grid.coarsened(go_on)?;
             size *= 2.0;
         }
-        coarse = Some(Level::from_grid(&grid, size, described));
+        coarse = Some(Level::from_grid(&grid, size, described, call)?);
     }
-    Ok(Prepared { origin, diagonal, fine, coarse })
+    Ok(Prepared { origin, diagonal, points_used, fine, coarse })
 }
 
 impl Level {
     /// Every point as it is, normals from its nearest neighbours.
-    fn sparse(points: Vec<[f32; 3]>, voxel_size: f64, described: Described) -> Self {
-        let tree = KdTree::new(&points);
-        let features = described == Described::Surely;
-        let graph =
-            if features { feature_graph(&tree, voxel_size as f32) } else { tree.knn_graph(NORMAL_NEIGHBORS) };
-        let planes = nearest_planes(&points, &graph, NORMAL_NEIGHBORS);
-        let normals = planes.iter().map(|p| p.normal).collect();
-        Self {
-            sparse: true,
-            graph: features.then_some(graph),
-            ..Self::new(points, normals, tree, voxel_size)
-        }
+    fn sparse(
+        points: Vec<[f32; 3]>,
+        voxel_size: f64,
+        described: Described,
+        call: &Call,
+    ) -> Result<Self, Stop> {
+        let is_over = || call.is_over();
+        let tree = KdTree::new_unless(&points, &is_over);
+        call.go_on()?;
+        let (graph, normals) = if described == Described::Surely {
+            let graph = feature_graph(&tree, voxel_size as f32, &is_over);
+            let planes = nearest_planes(&points, &graph, NORMAL_NEIGHBORS);
+            (Some(graph), planes.iter().map(|p| p.normal).collect())
+        } else {
+            let normal = |i: usize, nearest: &[_]| fit_plane(&points, points[i], nearest).normal;
+            (None, tree.map_nearest(NORMAL_NEIGHBORS, &is_over, normal))
+        };
+        call.go_on()?;
+        Ok(Self { sparse: true, graph, ..Self::new(points, normals, tree, voxel_size) })
     }
 
     /// One point a cell, normals from the points in and around it.
-    fn from_grid(grid: &VoxelGrid, voxel_size: f64, described: Described) -> Self {
+    fn from_grid(grid: &VoxelGrid, voxel_size: f64, described: Described, call: &Call) -> Result<Self, Stop> {
         let points: Vec<[f32; 3]> = grid.cells.iter().map(|c| c.mean().map(|v| v as f32)).collect();
         let total: f64 = grid.cells.iter().map(|c| c.count).sum();
         if total < DENSE_CELL * points.len() as f64 {
-            return Self::sparse(points, voxel_size, described);
+            return Self::sparse(points, voxel_size, described, call);
         }
         let (tree, normals) = rayon::join(
-            || KdTree::new(&points),
+            || KdTree::new_unless(&points, &|| call.is_over()),
             || {
                 (0..points.len())
                     .into_par_iter()
                     .with_min_len(256)
-                    .map(|i| normal_of(&grid.surroundings(i)))
+                    .map(|i| if call.is_over() { [0.0; 3] } else { normal_of(&grid.surroundings(i)) })
                     .collect::<Vec<_>>()
             },
         );
-        Self::new(points, normals, tree, voxel_size)
+        call.go_on()?;
+        Ok(Self::new(points, normals, tree, voxel_size))
     }
 
     fn new(points: Vec<[f32; 3]>, normals: Vec<[f32; 3]>, tree: KdTree, voxel_size: f64) -> Self {
@@ -299,16 +341,20 @@ impl Level {
     }
 
     /// Neighbourhoods that features look at.
-    pub fn feature_graph(&self) -> Cow<'_, Neighborhoods> {
+    ///
+    /// Of no use where `is_over`, asked now and then, said yes.
+    pub fn feature_graph(&self, is_over: IsOver) -> Cow<'_, Neighborhoods> {
         match &self.graph {
             Some(graph) => Cow::Borrowed(graph),
-            None => Cow::Owned(feature_graph(&self.tree, self.voxel_size)),
+            None => Cow::Owned(feature_graph(&self.tree, self.voxel_size, is_over)),
         }
     }
 
     /// At most `count` of all point indices.
     pub fn spread(&self, count: usize) -> Vec<u32> {
-        Self::thin(&(0..self.points.len() as u32).collect::<Vec<_>>(), count)
+        let all = 0..self.points.len() as u32;
+        let step = all.len().div_ceil(count.max(1)).max(1);
+        all.step_by(step).collect()
     }
 
     /// At most `count` point indices, spread evenly over `indices`.
@@ -318,8 +364,8 @@ impl Level {
     }
 }
 
-fn feature_graph(tree: &KdTree, voxel_size: f32) -> Neighborhoods {
-    tree.radius_graph(FEATURE_RADIUS_VOXELS * voxel_size, FEATURE_NEIGHBORS)
+fn feature_graph(tree: &KdTree, voxel_size: f32, is_over: IsOver) -> Neighborhoods {
+    tree.radius_graph_unless(FEATURE_RADIUS_VOXELS * voxel_size, FEATURE_NEIGHBORS, is_over)
 }
 
 fn normal_of(cell: &Cell) -> [f32; 3] {

@@ -7,19 +7,21 @@ use nalgebra::Matrix6;
 use rayon::prelude::*;
 
 use crate::{
-    CloudRole, Error, PointCloud, Result,
+    CloudRole, PointCloud, Result,
     cloud::orient_by_curvature,
     features::{Descriptors, Feature, FeatureInput},
     hypothesis::{Hypothesis, Match, Problem, SOURCES, are_alike, match_levels, separation, turned},
+    memory::most_cells,
     prepare::{Described, Level, Prepared, check, derive_voxel_size, prepare},
     refine::{Icp, LockedPose, Locks, Refined, Refinement, Schedule, factor},
-    registration::{Alternative, Reason, Registration, Timings},
+    registration::{Alternative, Reason, Registration, TRUSTWORTHY, Timings},
     settings::{Method, Settings},
     threads::on_threads,
     transform::Rigid,
     verify::{
         Calibration, Evidence, Sizes, conditioning, covariance, judge, meeting, overlap_at, scaled, seen,
     },
+    watch::{Call, Stage, Stop, Watch},
 };
 
 /// Hypotheses that are refined on the coarse level, and of those on the fine one.
@@ -50,6 +52,17 @@ const FINE_POINTS: usize = 6000;
 const SCORING_SCALES: u32 = 4;
 /// Poses closer than this many voxels at the source's rim are one answer.
 const DISTINCT_VOXELS: f64 = 6.0;
+/// Held-out points that are looked at although the time is up: they take a few milliseconds.
+const QUICKLY_SEEN: usize = 16_384;
+/// Points of the source that tell its size where nothing else is known.
+const GLANCED_POINTS: usize = 1024;
+/// Probability, at most, of a pose that was not refined to the end, or not compared with all that was to stand beside it.
+const CUT_SHORT: f64 = 0.9 * TRUSTWORTHY;
+/// Share of the longest way that is behind once the clouds are prepared; of a source's, once it has proposed its poses,
+/// and once these are refined.
+const PREPARED: f64 = 0.25;
+const PROPOSED: f64 = 0.5;
+const REFINED: f64 = 0.95;
 
 /// Finds the pose that lays `source` on `target`.
 ///
@@ -57,8 +70,23 @@ const DISTINCT_VOXELS: f64 = 6.0;
 /// Where a cloud is too small, degenerate or not finite, or a setting is out of its range. Clouds that cannot
 /// be registered are no error: the result says so (`probability`, `reasons`).
 pub fn register(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
+    register_watched(source, target, settings, &Watch::default())
+}
+
+/// As [`register`], watched: it may be cancelled, and tells how far it is. As long as it is not cancelled, the result is
+/// the same.
+///
+/// # Errors
+/// As [`register`].
+pub fn register_watched(
+    source: &PointCloud,
+    target: &PointCloud,
+    settings: &Settings,
+    watch: &Watch,
+) -> Result<Registration> {
     settings.check()?;
-    on_threads(settings.threads, || run(source, target, settings))?
+    let call = Call::new(settings.max_seconds, *watch);
+    on_threads(settings.threads, || run(source, target, settings, &call))?
 }
 
 /// A refined pose with its score.
@@ -71,33 +99,87 @@ struct Candidate {
     agreement: f64,
     /// Score of the best clearly different pose over that of this one, both coarsely refined.
     glimpsed: f64,
+    /// Whether it was refined to the end, and so was all that its source proposed beside it.
+    complete: bool,
 }
 
-fn run(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
+fn run(source: &PointCloud, target: &PointCloud, settings: &Settings, call: &Call) -> Result<Registration> {
     let start = Instant::now();
-    let mut found = run_as_is(source, target, settings)?;
-    if !found.is_trustworthy() {
+    let mut found = run_as_is(source, target, settings, call)?;
+    if !found.is_trustworthy() && call.ended_by().is_none() {
         let sizes = Sizes::of(source, target);
-        let plain = Settings { init: None, locks: Locks::default(), voxel_size: None, ..settings.clone() };
-        found.source_scale = sizes.factors().into_iter().find(|&factor| {
-            let fits = run_as_is(&scaled(source, factor), target, &plain);
-            fits.is_ok_and(|fits| fits.is_trustworthy())
-        });
+        found.source_scale = fitting_scale(&sizes, source, target, settings, call);
         if found.source_scale.is_some() || sizes.are_far_apart() {
             found.reasons.insert(0, Reason::ScaleMismatch);
         }
-        found.timings_ms.total = milliseconds(start);
     }
+    if let Some(reason) = call.ended_by() {
+        found.converged = false;
+        found.reasons.push(reason);
+    }
+    found.timings_ms.total = milliseconds(start);
+    call.end();
     Ok(found)
 }
 
+/// The factor that makes the source fit, where its own size does not.
+fn fitting_scale(
+    sizes: &Sizes,
+    source: &PointCloud,
+    target: &PointCloud,
+    settings: &Settings,
+    call: &Call,
+) -> Option<f64> {
+    let plain = Settings { init: None, locks: Locks::default(), voxel_size: None, ..settings.clone() };
+    sizes.factors().into_iter().find(|&factor| {
+        let fits = run_as_is(&scaled(source, factor), &scaled(target, 1.0), &plain, &call.aside());
+        fits.is_ok_and(|fits| fits.is_trustworthy())
+    })
+}
+
 /// The pose at the scale that the clouds have.
-fn run_as_is(source: &PointCloud, target: &PointCloud, settings: &Settings) -> Result<Registration> {
+fn run_as_is(
+    source: &PointCloud,
+    target: &PointCloud,
+    settings: &Settings,
+    call: &Call,
+) -> Result<Registration> {
     let start = Instant::now();
+    match prepare_both(source, target, settings, call) {
+        Ok(clouds) => {
+            let mut pipeline = Pipeline::new(&clouds, settings, call)?;
+            pipeline.timings.prepare = milliseconds(start);
+            pipeline.best()
+        }
+        Err(Stop::Failed(error)) => Err(error),
+        Err(Stop::Over | Stop::Full) => {
+            let mut none = nothing_known(glanced_radius(source), settings);
+            none.timings_ms.prepare = milliseconds(start);
+            Ok(none)
+        }
+    }
+}
+
+/// Both clouds, ready to be registered.
+struct Clouds {
+    source: Prepared,
+    target: Prepared,
+    voxel_size: f64,
+    asks_network: bool,
+}
+
+fn prepare_both(
+    source: &PointCloud,
+    target: &PointCloud,
+    settings: &Settings,
+    call: &Call,
+) -> Result<Clouds, Stop> {
+    call.begin(Stage::Prepare, None, (0.0, PREPARED));
+    call.go_on()?;
     let (source, target) =
-        rayon::join(|| check(source, CloudRole::Source), || check(target, CloudRole::Target));
-    let (source, target) = (source?, target?);
-    let voxel_size = settings.voxel_size.unwrap_or_else(|| derive_voxel_size(&source, &target));
+        rayon::join(|| check(source, CloudRole::Source, call), || check(target, CloudRole::Target, call));
+    let (mut source, mut target) = (source?, target?);
+    call.advance(0.2);
     let asks_network = match settings.method {
         Method::Auto => are_alike(source.cloud, target.cloud),
         method => method == Method::Upcr,
@@ -107,14 +189,39 @@ fn run_as_is(source: &PointCloud, target: &PointCloud, settings: &Settings) -> R
         _ if asks_network => Described::Perhaps,
         _ => Described::Surely,
     };
-    let (source, target) =
-        rayon::join(|| prepare(&source, voxel_size, described), || prepare(&target, voxel_size, described));
-    let (source, target) = (source?, target?);
-    let mut pipeline = Pipeline::new(&source, &target, voxel_size, asks_network, settings)?;
-    pipeline.timings.prepare = milliseconds(start);
-    let mut best = pipeline.best()?;
-    best.timings_ms.total = milliseconds(start);
-    Ok(best)
+    let most = most_cells(settings.max_memory_bytes, [source.len(), target.len()])?;
+    loop {
+        call.go_on()?;
+        let voxel_size = settings.voxel_size.unwrap_or_else(|| derive_voxel_size(&source, &target));
+        call.go_on()?;
+        call.advance(0.4);
+        let ready = rayon::join(
+            || prepare(&source, voxel_size, described, most[0], call),
+            || prepare(&target, voxel_size, described, most[1], call),
+        );
+        match ready {
+            (Err(Stop::Full), Err(Stop::Full)) => {
+                source.thin();
+                target.thin();
+            }
+            (Err(Stop::Full), _) => source.thin(),
+            (_, Err(Stop::Full)) => target.thin(),
+            (source, target) => {
+                return Ok(Clouds { source: source?, target: target?, voxel_size, asks_network });
+            }
+        }
+    }
+}
+
+/// About half the length of the cloud's bounding box's diagonal, from a few points that need not be sound; never zero.
+fn glanced_radius(cloud: &PointCloud) -> f64 {
+    let step = cloud.len().div_ceil(GLANCED_POINTS).max(1);
+    let few = cloud.points.iter().step_by(step).filter(|p| p.iter().all(|v| v.is_finite())).copied();
+    let bounds = PointCloud::from_points(few.collect()).checked_bounds(CloudRole::Source);
+    match bounds.ok().flatten().map(|b| 0.5 * b.diagonal()) {
+        Some(radius) if radius > 0.0 && radius.is_finite() => radius,
+        _ => 1.0,
+    }
 }
 
 fn milliseconds(since: Instant) -> f64 {
@@ -126,6 +233,7 @@ struct Pipeline<'a> {
     source: &'a Prepared,
     target: &'a Prepared,
     settings: &'a Settings,
+    call: &'a Call<'a>,
     voxel_size: f64,
     asks_network: bool,
     init: Rigid,
@@ -137,13 +245,8 @@ struct Pipeline<'a> {
 }
 
 impl<'a> Pipeline<'a> {
-    fn new(
-        source: &'a Prepared,
-        target: &'a Prepared,
-        voxel_size: f64,
-        asks_network: bool,
-        settings: &'a Settings,
-    ) -> Result<Self> {
+    fn new(clouds: &'a Clouds, settings: &'a Settings, call: &'a Call) -> Result<Self> {
+        let &Clouds { ref source, ref target, voxel_size, asks_network } = clouds;
         let init = settings.first_guess();
         let lock = LockedPose::new(settings.locks, &init, source.origin, target.origin);
         let init = to_local(&init, source, target);
@@ -151,6 +254,7 @@ impl<'a> Pipeline<'a> {
             source,
             target,
             settings,
+            call,
             voxel_size,
             asks_network,
             init,
@@ -165,10 +269,17 @@ impl<'a> Pipeline<'a> {
     /// Asks one source of hypotheses after the other until the verdict is sure.
     fn best(&mut self) -> Result<Registration> {
         let mut best = None;
-        for source in SOURCES {
-            if !self.wants(source.method()) {
-                continue;
+        let wanted: Vec<_> = SOURCES.iter().filter(|source| self.wants(source.method())).collect();
+        let part = (1.0 - PREPARED) / wanted.len() as f64;
+        for (source, from) in wanted.iter().zip((0..).map(|i| PREPARED + part * f64::from(i))) {
+            // A given pose is there at no cost.
+            if (best.is_some() || source.method() != Method::Prior) && self.call.is_over() {
+                break;
             }
+            let begin = |stage, share: (f64, f64)| {
+                self.call.begin(stage, Some(source.method()), (from + part * share.0, from + part * share.1));
+            };
+            begin(Stage::Hypotheses, (0.0, PROPOSED));
             let start = Instant::now();
             if source.needs_matches() && self.matches.is_empty() {
                 self.matches = self.feature_matches()?;
@@ -182,15 +293,23 @@ impl<'a> Pipeline<'a> {
                 tolerance: self.match_tolerance(),
                 seed: self.settings.seed,
                 alone: self.settings.method == source.method(),
+                call: self.call,
             };
             let hypotheses = source.propose(&problem);
             self.timings.hypotheses += milliseconds(start);
+            begin(Stage::Refine, (PROPOSED, REFINED));
             let start = Instant::now();
-            self.candidates.extend(self.refined(&hypotheses));
+            let refined = self.refined(&hypotheses);
+            let complete = self.call.ended_by().is_none();
+            self.candidates.extend(refined.into_iter().map(|c| Candidate { complete, ..c }));
             self.candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
             self.timings.refine += milliseconds(start);
+            begin(Stage::Verify, (REFINED, 1.0));
             let start = Instant::now();
-            let registration = self.verified();
+            let mut registration = self.verified();
+            if self.candidates.first().is_some_and(|best| !best.complete) {
+                registration.probability = registration.probability.min(CUT_SHORT);
+            }
             self.timings.verify += milliseconds(start);
             let sure = registration.probability >= source.sure();
             // What two sources find ambiguous alike is.
@@ -200,10 +319,7 @@ impl<'a> Pipeline<'a> {
                 break;
             }
         }
-        best.ok_or_else(|| Error::InvalidSetting {
-            name: "method",
-            reason: "no source of hypotheses has this name".into(),
-        })
+        Ok(best.unwrap_or_else(|| Registration { timings_ms: self.timings, ..self.nothing_found() }))
     }
 
     fn wants(&self, method: Method) -> bool {
@@ -221,7 +337,10 @@ impl<'a> Pipeline<'a> {
     fn feature_matches(&self) -> Result<Vec<Match>> {
         let (a, b) = (self.source.coarse(), self.target.coarse());
         let feature = self.settings.feature.feature();
-        let (da, db) = rayon::join(|| describe(a, feature), || describe(b, feature));
+        let (da, db) = rayon::join(|| describe(a, feature, self.call), || describe(b, feature, self.call));
+        if self.call.is_over() {
+            return Ok(Vec::new());
+        }
         Ok(match_levels((a, &da?), (b, &db?)))
     }
 
@@ -238,6 +357,7 @@ impl<'a> Pipeline<'a> {
             factor: factor(self.settings.refine, source.sparse && target.sparse),
             kernel: self.settings.kernel,
             lock: self.lock.as_ref(),
+            call: self.call,
         }
     }
 
@@ -258,7 +378,7 @@ impl<'a> Pipeline<'a> {
         };
         let moved = source.spread(COARSE_POINTS);
         let coarsely_refined = |ranked: Vec<(f64, Hypothesis)>| {
-            if self.settings.refine == Refinement::None {
+            if self.settings.refine == Refinement::None || ranked.is_empty() || self.call.is_over() {
                 return ranked;
             }
             let icp = self.icp(source, target);
@@ -268,11 +388,16 @@ impl<'a> Pipeline<'a> {
             });
             refined.collect()
         };
+        // The best come first.
+        let few = hypotheses.len().min(COARSE_CANDIDATES);
+        let hypotheses =
+            if hypotheses.len() > few && self.call.is_over() { &hypotheses[..few] } else { hypotheses };
         let mut ranked = coarsely_refined(promising(hypotheses, RANKING_POINTS, PROMISING, 0.0));
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         let proposed: Vec<Rigid> = ranked.iter().map(|(_, h)| h.pose).collect();
         if let Some((score, best)) = ranked.first()
             && *score < COINCIDENT
+            && !self.call.is_over()
         {
             let turns: Vec<Hypothesis> =
                 turned(source, &best.pose).into_iter().map(|pose| Hypothesis { pose, ..*best }).collect();
@@ -290,11 +415,16 @@ impl<'a> Pipeline<'a> {
         }
         let best = distinct.first().map_or(0.0, |best| best.0);
         let second = distinct.get(1).map_or(0.0, |second| second.0);
-        let fine = distinct.iter().enumerate().take_while(|(rank, (score, _))| {
-            let enough = if *rank < FINE_CANDIDATES { PROMISING } else { RIVALLING };
-            *rank < RIVALS && *score >= enough * best
-        });
+        let worth_it = |rank: usize, score: f64| {
+            let enough = if rank < FINE_CANDIDATES { PROMISING } else { RIVALLING };
+            rank < RIVALS && score >= enough * best
+        };
+        let count =
+            distinct.iter().enumerate().take_while(|(rank, (score, _))| worth_it(*rank, *score)).count();
+        let going_on = |&(rank, _): &(usize, _)| rank == 0 || !self.call.is_over();
+        let fine = distinct[..count].iter().enumerate().take_while(going_on);
         fine.map(|(rank, (score, h))| {
+            self.call.advance(rank as f64 / count as f64);
             let agreeing = proposed.iter().filter(|pose| same(pose, &h.pose)).count();
             Candidate {
                 agreement: agreeing as f64 / proposed.len().max(1) as f64,
@@ -322,7 +452,7 @@ impl<'a> Pipeline<'a> {
             // A guess may be further off than what the coarse level brings near.
             let first = if hypothesis.method == Method::Prior { 3.0 * reach } else { 1.5 * reach };
             let found = icp.refine(&few, &hypothesis.pose, &Schedule::fine(first, reach, keep));
-            if few.len() == moved.len() {
+            if few.len() == moved.len() || self.call.is_over() {
                 found
             } else {
                 let all = Level::thin(&moved, FINE_POINTS);
@@ -345,6 +475,7 @@ impl<'a> Pipeline<'a> {
             closeness,
             agreement: 0.0,
             glimpsed: 0.0,
+            complete: true,
         }
     }
 
@@ -357,8 +488,12 @@ impl<'a> Pipeline<'a> {
         let others = self.others(best);
         let (source, target) = (&self.source.fine, &self.target.fine);
         let limit = self.voxel_size as f32;
-        let forward = meeting(source, &self.source.held_out_points(), target, pose, limit);
-        let backward = meeting(target, &self.target.held_out_points(), source, &pose.inverse(), limit);
+        let held_out = |cloud: &Prepared| match cloud.held_out_points() {
+            all if all.len() > QUICKLY_SEEN && self.call.is_over() => Level::thin(&all, QUICKLY_SEEN),
+            all => all,
+        };
+        let forward = meeting(source, &held_out(self.source), target, pose, limit);
+        let backward = meeting(target, &held_out(self.target), source, &pose.inverse(), limit);
         let tolerance = self.match_tolerance();
         let explained = |matches: &[Match]| matches.iter().filter(|m| m.agrees_with(pose, tolerance)).count();
         let evidence = Evidence {
@@ -431,40 +566,59 @@ impl<'a> Pipeline<'a> {
 
     /// The answer where no source of hypotheses had any.
     fn nothing_found(&self) -> Registration {
-        let radius = f64::from(self.source.fine.radius);
-        let covariance = covariance(&Matrix6::zeros(), 0.0, radius);
         let points = self.source.fine.points.len().min(self.target.fine.points.len());
+        let none = nothing_known(f64::from(self.source.fine.radius), self.settings);
         Registration {
             // As it was given: what is locked is held to the last bit.
             T_target_source: self.settings.first_guess(),
-            fitness: 0.0,
-            inlier_rmse: 0.0,
-            num_inliers: 0,
-            converged: false,
-            iterations: 0,
-            probability: 0.0,
-            covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
-            reasons: judge(&Evidence::none(points), &self.calibration).reasons,
-            alternatives: Vec::new(),
-            source_scale: None,
+            // Nothing speaks against a pose that was not looked for.
+            reasons: match self.call.ended_by() {
+                None => judge(&Evidence::none(points), &self.calibration).reasons,
+                Some(_) => Vec::new(),
+            },
             evidence: Evidence::none(points),
-            method: self.settings.method,
             voxel_size: self.voxel_size,
-            settings: Settings { voxel_size: Some(self.voxel_size), ..self.settings.clone() },
-            timings_ms: Timings::default(),
+            points_used: [self.source.points_used, self.target.points_used],
+            settings: Settings { voxel_size: Some(self.voxel_size), ..none.settings },
+            ..none
         }
+    }
+}
+
+/// The answer where nothing is known but about how large the source is.
+fn nothing_known(radius: f64, settings: &Settings) -> Registration {
+    let covariance = covariance(&Matrix6::zeros(), 0.0, radius);
+    Registration {
+        T_target_source: settings.first_guess(),
+        fitness: 0.0,
+        inlier_rmse: 0.0,
+        num_inliers: 0,
+        converged: false,
+        iterations: 0,
+        probability: 0.0,
+        covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
+        reasons: Vec::new(),
+        alternatives: Vec::new(),
+        source_scale: None,
+        evidence: Evidence::none(0),
+        method: settings.method,
+        voxel_size: settings.voxel_size.unwrap_or(0.0),
+        points_used: [0; 2],
+        settings: settings.clone(),
+        timings_ms: Timings::default(),
     }
 }
 
 /// Matched points lie this many coarse voxels apart at most under a right pose.
 const TOLERANCE_VOXELS: f32 = 1.5;
 
-fn describe(level: &Level, feature: &dyn Feature) -> Result<Descriptors> {
-    let neighborhoods = level.feature_graph();
+fn describe(level: &Level, feature: &dyn Feature, call: &Call) -> Result<Descriptors> {
+    let is_over = || call.is_over();
+    let neighborhoods = level.feature_graph(&is_over);
     let mut normals = level.normals.clone();
     orient_by_curvature(&level.points, &mut normals, &neighborhoods);
     let input = FeatureInput { points: &level.points, normals: &normals, neighborhoods: &neighborhoods };
-    feature.compute(&input)
+    feature.compute_unless(&input, &is_over)
 }
 
 fn to_local(file: &Rigid, source: &Prepared, target: &Prepared) -> Rigid {

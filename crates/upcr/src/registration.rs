@@ -29,6 +29,10 @@ pub enum Reason {
     NotConverged,
     /// The surfaces lie near each other, but not as closely as right poses let them.
     PoorFit,
+    /// The time limit ended the call before it was done.
+    TimeLimit,
+    /// The caller ended the call before it was done.
+    Cancelled,
 }
 
 impl std::fmt::Display for Reason {
@@ -44,6 +48,8 @@ impl std::fmt::Display for Reason {
             }
             Self::NotConverged => "the refinement did not settle",
             Self::PoorFit => "the surfaces lie near each other, but not as closely as a right pose lets them",
+            Self::TimeLimit => "the time limit ended the search early",
+            Self::Cancelled => "the search was cancelled",
         })
     }
 }
@@ -83,7 +89,7 @@ pub struct Registration {
     pub inlier_rmse: f64,
     /// How many there are.
     pub num_inliers: usize,
-    /// Whether the refinement settled, with inliers to settle on.
+    /// Whether the refinement settled, with inliers to settle on, and nothing ended the call early.
     pub converged: bool,
     /// Refinement iterations of the returned pose.
     pub iterations: usize,
@@ -103,8 +109,10 @@ pub struct Registration {
     pub evidence: Evidence,
     /// Which source the winning hypothesis came from.
     pub method: Method,
-    /// The scale used, in the clouds' unit.
+    /// The scale used, in the clouds' unit; 0 where the call ended before it was known.
     pub voxel_size: f64,
+    /// Points of source and target that were looked at: all, or every so-many-th where memory is bounded.
+    pub points_used: [usize; 2],
     /// The effective settings.
     pub settings: Settings,
     /// Where the time went.

@@ -67,6 +67,12 @@ pub struct Settings {
     pub seed: u64,
     /// Threads to use; `None`: all that the current rayon pool has. The result does not depend on it.
     pub threads: Option<NonZeroUsize>,
+    /// Seconds from the call on after which it ends, with the best pose so far; `None`: as many as it takes. Calls that
+    /// share a rayon pool may wait for each other's steps.
+    pub max_seconds: Option<f64>,
+    /// Bytes that the call may take beyond its input clouds and a network of one's own; `None`: as many as it takes.
+    /// Where a cloud needs more, only every so-many-th point of it is used ([`crate::Registration::points_used`]).
+    pub max_memory_bytes: Option<u64>,
 }
 
 impl Default for Settings {
@@ -84,6 +90,8 @@ impl Default for Settings {
             calibration: None,
             seed: 0,
             threads: None,
+            max_seconds: None,
+            max_memory_bytes: None,
         }
     }
 }
@@ -110,6 +118,11 @@ impl Settings {
             && !(share > 0.0 && share <= 1.0)
         {
             return refused("overlap", format!("must be a share above 0 and at most 1, not {share}"));
+        }
+        if let Some(seconds) = self.max_seconds
+            && !(seconds.is_finite() && seconds >= 0.0)
+        {
+            return refused("max_seconds", format!("must be a time of at least 0 s, not {seconds}"));
         }
         if let Some(init) = &self.init
             && let Err(reason) = Rigid::from_rows(&init.to_rows())

@@ -217,6 +217,75 @@ fn a_list_of_pairs_is_answered_line_by_line() {
 }
 
 #[test]
+fn equal_answers_without_times_are_equal_bytes() {
+    let scratch = Scratch::new();
+    let (source, target) = (sample("source.ply"), sample("target.ply"));
+    let list =
+        scratch.file("pairs.txt", format!("{source}\t{target}\n{source}\t{}\n", scratch.path("nowhere.ply")));
+    for (call, status) in [(vec![&*source, &target, "--json"], 0), (vec!["--pairs", &list], 1)] {
+        let run = |threads| {
+            let run = upcr([&["register"], &call[..], &["--no-times", "--threads", threads]].concat());
+            assert_eq!(run.status, status, "{}", run.stderr);
+            run.stdout
+        };
+        let (one, two) = (run("1"), run("2"));
+        assert_eq!(one, two);
+        for (word, is_there) in
+            [("timings_ms", false), ("threads", false), ("probability", true), ("max_seconds", true)]
+        {
+            assert_eq!(one.contains(&format!("\"{word}\"")), is_there, "{word} in {one}");
+        }
+    }
+    assert_eq!(upcr(["register", &source, &target, "--no-times"]).status, 2, "a summary has its times");
+}
+
+#[test]
+fn no_time_is_no_pose_but_an_answer() {
+    let (source, target) = (sample("source.ply"), sample("target.ply"));
+    let run = upcr(["register", &source, &target, "--max-seconds", "0", "--json"]);
+    assert_eq!(run.status, 3, "{}", run.stderr);
+    let answer = run.json();
+    assert_eq!(answer["reasons"], serde_json::json!(["time_limit"]));
+    assert_eq!((&answer["probability"], &answer["converged"]), (&0.0.into(), &false.into()));
+    assert_eq!(answer["settings"]["max_seconds"], 0.0);
+    let run = upcr(["register", &source, &target, "--max-seconds", "0"]);
+    assert!(run.stdout.contains("the time limit ended the search early"), "{}", run.stdout);
+    let ample = upcr(["register", &source, &target, "--max-seconds", "1e6", "--json"]);
+    assert_eq!((ample.status, &ample.json()["reasons"]), (0, &serde_json::json!([])));
+    upcr(["register", &source, &target, "--max-seconds", "-1"]).assert_fails(1, &["max_seconds", "-1"]);
+}
+
+#[test]
+fn memory_is_bounded_in_any_unit() {
+    let scratch = Scratch::new();
+    let (source, target) = (sample("source.ply"), sample("target.ply"));
+    for (told, bytes) in [("16777216", 16 << 20), ("16384k", 16 << 20), ("16M", 16 << 20), ("1G", 1 << 30)] {
+        let run = upcr(["register", &source, &target, "--max-memory", told, "--json"]);
+        assert_eq!(run.status, 0, "{}", run.stderr);
+        assert_eq!(run.json()["settings"]["max_memory_bytes"], bytes);
+    }
+    // Cells as small as the points' distances do not fit: half of the points do.
+    let cloud = scratch.xyz("cloud.xyz", &surface(150, 1.0));
+    let fine = ["register", &cloud, &cloud, "--voxel-size", "0.005"];
+    let used = |run: crate::Run| run.json()["points_used"].clone();
+    assert_eq!(used(upcr([&fine[..], &["--json"]].concat())), serde_json::json!([22500, 22500]));
+    let run = upcr([&fine[..], &["--json", "--max-memory", "20M"]].concat());
+    assert_eq!(used(run), serde_json::json!([11250, 11250]));
+    let run = upcr([&fine[..], &["--max-memory", "20M"]].concat());
+    assert!(run.stdout.contains("11250 of the source"), "{}", run.stdout);
+
+    let run = upcr(["register", &source, &target, "--max-memory", "1M"]);
+    run.assert_fails(1, &["at least", "1048576"]);
+    for wrong in ["lots", "-1", "2 G", "M", "1.5G", "99999999T"] {
+        assert_eq!(
+            upcr(["register", &source, &target, &format!("--max-memory={wrong}")]).status,
+            2,
+            "{wrong}"
+        );
+    }
+}
+
+#[test]
 fn outputs_that_cannot_be_written_are_refused_before_the_work() {
     let scratch = Scratch::new();
     let (source, target) = (sample("source.ply"), sample("target.ply"));

@@ -2,6 +2,9 @@
 
 use crate::{CloudRole, Error, PointCloud, Result};
 
+/// Points checked between two looks at whether to go on.
+const BLOCK: usize = 1 << 16;
+
 /// Axis-aligned bounding box.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Bounds {
@@ -34,13 +37,25 @@ impl PointCloud {
     /// # Errors
     /// [`Error::NonFinite`], naming `role`, where a coordinate is NaN or infinite.
     pub fn checked_bounds(&self, role: CloudRole) -> Result<Option<Bounds>> {
+        self.checked_bounds_while(role, || Ok(()))
+    }
+
+    /// As [`Self::checked_bounds`], as long as `go_on`, asked now and then, has nothing against it.
+    pub(crate) fn checked_bounds_while<E: From<Error>>(
+        &self,
+        role: CloudRole,
+        go_on: impl Fn() -> Result<(), E>,
+    ) -> Result<Option<Bounds>, E> {
         let (mut min, mut max) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
         let mut finite = true;
-        for p in &self.points {
-            for k in 0..3 {
-                min[k] = min[k].min(p[k]);
-                max[k] = max[k].max(p[k]);
-                finite &= p[k].is_finite();
+        for block in self.points.chunks(BLOCK) {
+            go_on()?;
+            for p in block {
+                for k in 0..3 {
+                    min[k] = min[k].min(p[k]);
+                    max[k] = max[k].max(p[k]);
+                    finite &= p[k].is_finite();
+                }
             }
         }
         if !finite {
@@ -49,7 +64,8 @@ impl PointCloud {
                 role,
                 count: self.points.iter().filter(bad).count(),
                 first: self.points.iter().position(|p| bad(&p)).unwrap_or(0),
-            });
+            }
+            .into());
         }
         Ok((!self.is_empty()).then_some(Bounds { min, max }))
     }

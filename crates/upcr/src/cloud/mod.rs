@@ -11,7 +11,7 @@ pub(crate) mod voxel;
 
 pub use bounds::Bounds;
 pub use normals::{LocalPlane, Support, local_planes, orient_by_curvature, orient_to_viewpoint};
-pub(crate) use normals::{nearest_planes, plane_normal};
+pub(crate) use normals::{fit_plane, nearest_planes, plane_normal};
 pub use outliers::statistical_inliers;
 pub use sample::{farthest_points, random_indices};
 pub(crate) use spread::{deviations, mean, principal_axes};
@@ -44,6 +44,11 @@ pub struct TriangleMesh {
     pub triangles: Vec<[u32; 3]>,
 }
 
+/// A point less `origin`.
+pub(crate) fn local(p: [f64; 3], origin: [f64; 3]) -> [f32; 3] {
+    std::array::from_fn(|k| (p[k] - origin[k]) as f32)
+}
+
 impl PointCloud {
     /// A cloud of bare points.
     pub fn from_points(points: Vec<[f64; 3]>) -> Self {
@@ -62,7 +67,7 @@ impl PointCloud {
 
     /// The points less `origin`: small numbers, which single precision holds well.
     pub(crate) fn local_points(&self, origin: [f64; 3]) -> Vec<[f32; 3]> {
-        self.points.iter().map(|p| std::array::from_fn(|k| (p[k] - origin[k]) as f32)).collect()
+        self.points.iter().map(|&p| local(p, origin)).collect()
     }
 
     /// The cloud of the points at `indices`, in that order, with their normals and colours.

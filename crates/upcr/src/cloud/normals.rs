@@ -127,8 +127,9 @@ pub fn orient_by_curvature(points: &[[f32; 3]], normals: &mut [[f32; 3]], neighb
     });
 }
 
+/// The plane fitted to points about `center`.
 #[multiversion(targets("x86_64+avx2"))]
-fn fit_plane(points: &[[f32; 3]], center: [f32; 3], neighbors: &[Neighbor]) -> LocalPlane {
+pub(crate) fn fit_plane(points: &[[f32; 3]], center: [f32; 3], neighbors: &[Neighbor]) -> LocalPlane {
     if neighbors.len() < MIN_NEIGHBORS {
         return LocalPlane { normal: [0.0; 3], eigenvalues: [0.0; 3] };
     }

@@ -8,6 +8,9 @@ const MAX_CELLS_PER_AXIS: f64 = (1u64 << 21) as f64;
 /// Occupied cells of a typical grid: room for so many is made at once.
 const TYPICAL_CELLS: usize = 16_384;
 
+/// Points or cells between two looks at whether to go on.
+const BLOCK: usize = 8192;
+
 /// What fell into one cell: sums about the grid's corner, and how many points.
 ///
 /// The second moments make the surface normal a by-product of the one pass over the points.
@@ -73,13 +76,16 @@ pub(crate) fn smallest_voxel_size(extent: f64) -> f64 {
 
 impl VoxelGrid {
     /// Sorts `points`, shifted by `-origin`, into cells of edge `voxel_size`; `corner` is the lowest corner
-    /// of the shifted points.
-    pub fn new(
+    /// of the shifted points. `None` where they occupy more than `most` cells; as long as `go_on`, asked now and then,
+    /// has nothing against it.
+    pub fn new<E>(
         points: impl Iterator<Item = [f64; 3]>,
         origin: [f64; 3],
         corner: [f64; 3],
         voxel_size: f64,
-    ) -> Self {
+        most: usize,
+        go_on: impl Fn() -> Result<(), E>,
+    ) -> Result<Option<Self>, E> {
         let mut grid = Self {
             cells: Vec::with_capacity(TYPICAL_CELLS),
             keys: Vec::with_capacity(TYPICAL_CELLS),
@@ -87,7 +93,10 @@ impl VoxelGrid {
         };
         let scale = 1.0 / voxel_size;
         let (mut last_key, mut last_cell) = (EMPTY, 0);
-        for p in points {
+        for (i, p) in points.enumerate() {
+            if i.is_multiple_of(BLOCK) {
+                go_on()?;
+            }
             let local = [p[0] - origin[0], p[1] - origin[1], p[2] - origin[2]];
             let key = key_of(std::array::from_fn(|k| ((local[k] - corner[k]) * scale) as u64));
             // Neighbouring points of a scan mostly share a cell.
@@ -95,29 +104,39 @@ impl VoxelGrid {
                 last_cell = grid.table.entry(key, grid.cells.len() as u32) as usize;
                 last_key = key;
                 if last_cell == grid.cells.len() {
+                    if last_cell == most {
+                        return Ok(None);
+                    }
                     grid.cells.push(Cell::default());
                     grid.keys.push(key);
                 }
             }
             grid.cells[last_cell].add(local);
         }
-        grid
+        Ok(Some(grid))
     }
 
-    /// The grid of twice the voxel size, its cells the sums of up to eight of this grid's.
-    pub fn coarsened(&self) -> Self {
-        let mut grid =
-            Self { cells: Vec::new(), keys: Vec::new(), table: CellTable::with_capacity(self.cells.len()) };
-        for (cell, &key) in self.cells.iter().zip(&self.keys) {
-            let key = key_of(unpack(key).map(|c| (c - 1) / 2));
-            let at = grid.table.entry(key, grid.cells.len() as u32) as usize;
-            if at == grid.cells.len() {
-                grid.cells.push(Cell::default());
-                grid.keys.push(key);
+    /// The grid of twice the voxel size, its cells the sums of up to eight of this grid's, in the same memory.
+    pub fn coarsened<E>(mut self, go_on: impl Fn() -> Result<(), E>) -> Result<Self, E> {
+        self.table.clear();
+        let mut len = 0;
+        for i in 0..self.cells.len() {
+            if i.is_multiple_of(BLOCK) {
+                go_on()?;
             }
-            grid.cells[at].merge(cell);
+            // A cell is met before any behind it needs its place.
+            let (cell, key) = (self.cells[i], key_of(unpack(self.keys[i]).map(|c| (c - 1) / 2)));
+            let at = self.table.entry(key, len as u32) as usize;
+            if at == len {
+                self.cells[at] = Cell::default();
+                self.keys[at] = key;
+                len += 1;
+            }
+            self.cells[at].merge(&cell);
         }
-        grid
+        self.cells.truncate(len);
+        self.keys.truncate(len);
+        Ok(self)
     }
 
     /// Moments of cell `i` and the occupied ones of the six that share a face with it.
@@ -247,6 +266,11 @@ impl CellTable {
         Self { slots: vec![(EMPTY, 0); slots.next_power_of_two()], len: 0 }
     }
 
+    fn clear(&mut self) {
+        self.slots.fill((EMPTY, 0));
+        self.len = 0;
+    }
+
     fn slot(&self, key: u64) -> usize {
         let mask = self.slots.len() - 1;
         // Fibonacci hashing; the high bits are the well mixed ones.
@@ -284,6 +308,8 @@ impl CellTable {
 
 #[cfg(test)]
 mod tests {
+    use std::convert::Infallible;
+
     use super::*;
 
     #[test]
@@ -315,12 +341,18 @@ mod tests {
     fn coarse_cells_are_sums_of_fine_ones() {
         let points: Vec<[f64; 3]> =
             (0..5000).map(|i| [(i * 37 % 101) as f64, (i * 53 % 97) as f64, (i * 11 % 89) as f64]).collect();
-        let grid = |size| VoxelGrid::new(points.iter().copied(), [0.0; 3], [0.0; 3], size);
-        let (coarsened, direct) = (grid(4.0).coarsened(), grid(8.0));
+        let up_to = |most, size| {
+            VoxelGrid::new(points.iter().copied(), [0.0; 3], [0.0; 3], size, most, || Ok::<_, Infallible>(()))
+                .unwrap()
+        };
+        let grid = |size| up_to(points.len(), size).unwrap();
+        let (coarsened, direct) = (grid(4.0).coarsened(|| Ok::<_, Infallible>(())).unwrap(), grid(8.0));
         assert_eq!(coarsened.keys, direct.keys);
         for (a, b) in coarsened.cells.iter().zip(&direct.cells) {
             assert_eq!((a.sum, a.outer, a.count), (b.sum, b.outer, b.count));
         }
-        assert_eq!(direct.cells.len(), count_occupied(&points, [0.0; 3], 8.0));
+        let count = direct.cells.len();
+        assert_eq!(count, count_occupied(&points, [0.0; 3], 8.0));
+        assert!(up_to(count, 8.0).is_some() && up_to(count - 1, 8.0).is_none());
     }
 }

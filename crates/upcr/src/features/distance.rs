@@ -1,7 +1,7 @@
 //! Distances among a point, its neighbours and the cloud's centroid (UPCR).
 
 use super::edges::per_edge;
-use super::{Descriptors, Feature, FeatureInput};
+use super::{Descriptors, Feature, FeatureInput, IsOver};
 use crate::error::Result;
 
 /// For every edge from point xᵢ to a neighbour xᵢⱼ: |xᵢⱼ - o|, |xᵢⱼ - xᵢ| and |o - xᵢ|, in the clouds' unit,
@@ -22,7 +22,7 @@ impl Feature for Distance {
         false
     }
 
-    fn compute(&self, input: &FeatureInput) -> Result<Descriptors> {
+    fn compute_unless(&self, input: &FeatureInput, is_over: IsOver) -> Result<Descriptors> {
         input.check(self)?;
         let mut sum = [0.0_f64; 3];
         for p in input.points {
@@ -32,7 +32,7 @@ impl Feature for Distance {
         }
         let o = sum.map(|s| (s / input.points.len() as f64) as f32);
         let to_centroid: Vec<f32> = input.points.iter().map(|p| distance(*p, o)).collect();
-        Ok(per_edge(input, |i, neighbor| {
+        Ok(per_edge(input, is_over, |i, neighbor| {
             [to_centroid[neighbor.index as usize], neighbor.distance_sq.sqrt(), to_centroid[i]]
         }))
     }

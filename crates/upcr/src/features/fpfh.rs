@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 
 use super::spfh::{self, BINS, DIM};
-use super::{Descriptors, Feature, FeatureInput, rows};
+use super::{Descriptors, Feature, FeatureInput, IsOver, rows};
 use crate::error::Result;
 
 /// A point's own simplified histogram plus the mean of its neighbours', weighted by 1 / squared distance.
@@ -25,10 +25,10 @@ impl Feature for Fpfh {
         true
     }
 
-    fn compute(&self, input: &FeatureInput) -> Result<Descriptors> {
+    fn compute_unless(&self, input: &FeatureInput, is_over: IsOver) -> Result<Descriptors> {
         input.check(self)?;
-        let simplified = spfh::histograms(input);
-        let rows = rows(simplified.len(), || (), |(), i| weighted(input, &simplified, i));
+        let simplified = spfh::histograms(input, is_over);
+        let rows = rows(simplified.len(), is_over, || (), |(), i| weighted(input, &simplified, i));
         Ok(Descriptors { dim: DIM, values: rows.into_flattened() })
     }
 }

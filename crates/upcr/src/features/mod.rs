@@ -5,6 +5,7 @@ use serde::Serialize;
 
 use crate::error::{Error, Result};
 use crate::neighbors::Neighborhoods;
+use crate::watch::IsOver;
 
 mod describe;
 mod distance;
@@ -34,7 +35,12 @@ pub trait Feature: Send + Sync {
     fn needs_normals(&self) -> bool;
 
     /// The descriptors of all points, in parallel; the same whatever the number of threads.
-    fn compute(&self, input: &FeatureInput) -> Result<Descriptors>;
+    fn compute(&self, input: &FeatureInput) -> Result<Descriptors> {
+        self.compute_unless(input, &|| false)
+    }
+
+    /// As [`Self::compute`]; rows stay zero once `is_over`, asked now and then, said yes.
+    fn compute_unless(&self, input: &FeatureInput, is_over: IsOver) -> Result<Descriptors>;
 }
 
 /// Every feature there is.
@@ -73,6 +79,7 @@ impl MatchedFeature {
 /// A row a point, in parallel; `room` makes what a task reuses from row to row.
 fn rows<const DIM: usize, S>(
     points: usize,
+    is_over: IsOver,
     room: impl Fn() -> S + Sync,
     row: impl Fn(&mut S, usize) -> [f32; DIM] + Sync,
 ) -> Vec<[f32; DIM]> {
@@ -80,6 +87,9 @@ fn rows<const DIM: usize, S>(
     const CHUNK: usize = 64;
     let mut rows = vec![[0.0; DIM]; points];
     rows.par_chunks_mut(CHUNK).enumerate().for_each(|(chunk, rows)| {
+        if is_over() {
+            return;
+        }
         let mut room = room();
         for (out, i) in rows.iter_mut().zip(chunk * CHUNK..) {
             *out = row(&mut room, i);

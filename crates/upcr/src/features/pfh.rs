@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 
 use super::pair::{AngleBins, LANES, PairAngles, Points, cosine_bins};
-use super::{Descriptors, Feature, FeatureInput, rows};
+use super::{Descriptors, Feature, FeatureInput, IsOver, rows};
 use crate::error::Result;
 
 /// Bins of each of the three angles.
@@ -31,10 +31,11 @@ impl Feature for Pfh {
         true
     }
 
-    fn compute(&self, input: &FeatureInput) -> Result<Descriptors> {
+    fn compute_unless(&self, input: &FeatureInput, is_over: IsOver) -> Result<Descriptors> {
         input.check(self)?;
         let bins = AngleBins::new();
-        let rows = rows(input.points.len(), Vec::new, |batches, i| histogram(input, i, &bins, batches));
+        let rows =
+            rows(input.points.len(), is_over, Vec::new, |batches, i| histogram(input, i, &bins, batches));
         Ok(Descriptors { dim: DIM, values: rows.into_flattened() })
     }
 }

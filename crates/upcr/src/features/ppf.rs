@@ -2,7 +2,7 @@
 
 use super::edges::per_edge;
 use super::pair::{cross, dot};
-use super::{Descriptors, Feature, FeatureInput};
+use super::{Descriptors, Feature, FeatureInput, IsOver};
 use crate::error::Result;
 
 /// For every edge d from a point to a neighbour, with normals n₁ and n₂: |d|, ∠(n₁, d), ∠(n₂, d) and
@@ -23,9 +23,9 @@ impl Feature for Ppf {
         true
     }
 
-    fn compute(&self, input: &FeatureInput) -> Result<Descriptors> {
+    fn compute_unless(&self, input: &FeatureInput, is_over: IsOver) -> Result<Descriptors> {
         input.check(self)?;
-        Ok(per_edge(input, |i, neighbor| {
+        Ok(per_edge(input, is_over, |i, neighbor| {
             let j = neighbor.index as usize;
             let d = [0, 1, 2].map(|a| input.points[j][a] - input.points[i][a]);
             let (n1, n2) = (input.normals[i], input.normals[j]);

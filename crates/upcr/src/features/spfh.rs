@@ -3,7 +3,7 @@
 use multiversion::multiversion;
 
 use super::pair::{AngleBins, LANES, PairAngles, Points, cosine_bins};
-use super::{Descriptors, Feature, FeatureInput, rows};
+use super::{Descriptors, Feature, FeatureInput, IsOver, rows};
 use crate::error::Result;
 use crate::neighbors::Neighbor;
 
@@ -31,16 +31,16 @@ impl Feature for Spfh {
         true
     }
 
-    fn compute(&self, input: &FeatureInput) -> Result<Descriptors> {
+    fn compute_unless(&self, input: &FeatureInput, is_over: IsOver) -> Result<Descriptors> {
         input.check(self)?;
-        Ok(Descriptors { dim: DIM, values: histograms(input).into_flattened() })
+        Ok(Descriptors { dim: DIM, values: histograms(input, is_over).into_flattened() })
     }
 }
 
 /// The histograms of every point.
-pub(super) fn histograms(input: &FeatureInput) -> Vec<[f32; DIM]> {
+pub(super) fn histograms(input: &FeatureInput, is_over: IsOver) -> Vec<[f32; DIM]> {
     let bins = AngleBins::new();
-    rows(input.points.len(), || (), |(), i| histogram(input, i, &bins))
+    rows(input.points.len(), is_over, || (), |(), i| histogram(input, i, &bins))
 }
 
 #[multiversion(targets("x86_64+avx2"))]

@@ -33,11 +33,12 @@ impl HypothesisSource for Consensus {
     }
 
     fn propose(&self, problem: &Problem) -> Vec<Hypothesis> {
-        let matches = most_distinctive(problem.matches);
+        let (matches, call) = (most_distinctive(problem.matches), problem.call);
         let graph = Compatibility::new(&matches, problem.tolerance);
         let mut seeds: Vec<(u64, u32)> = (0..matches.len().min(SEEDS) as u32)
             .into_par_iter()
-            .map(|i| (graph.second_order_degree(i as usize), i))
+            // A match that is not looked at any more seeds nothing.
+            .map(|i| (if call.is_over() { 0 } else { graph.second_order_degree(i as usize) }, i))
             .collect();
         seeds.sort_unstable_by_key(|&(degree, i)| (std::cmp::Reverse(degree), i));
         // Matches of one consensus lead to one pose: the best of them speaks for the others.

@@ -13,7 +13,7 @@ pub(crate) use matching::{Match, match_levels};
 pub(crate) use turns::turned;
 pub(crate) use upcr::{ALIKE, are_alike};
 
-use crate::{net::Network, prepare::Prepared, settings::Method, transform::Rigid};
+use crate::{net::Network, prepare::Prepared, settings::Method, transform::Rigid, watch::Call};
 
 /// A pose to be refined and verified, in local frames.
 #[derive(Debug, Clone, Copy)]
@@ -39,6 +39,8 @@ pub(crate) struct Problem<'a> {
     pub seed: u64,
     /// Whether no other source will be asked.
     pub alone: bool,
+    /// The call, which may be over before a source is done: then it proposes what it has.
+    pub call: &'a Call<'a>,
 }
 
 /// Something that proposes poses, best first.
@@ -85,7 +87,13 @@ mod tests {
     use crate::{
         CloudRole, PointCloud,
         prepare::{Described, check, prepare},
+        watch::Watch,
     };
+
+    fn ready(cloud: &PointCloud, call: &Call) -> Prepared {
+        let checked = check(cloud, CloudRole::Cloud, call).unwrap();
+        prepare(&checked, 0.5, Described::Surely, cloud.len(), call).unwrap()
+    }
 
     /// 300 matches of which 90 follow one motion and the others none.
     fn planted(truth: &Rigid) -> Vec<Match> {
@@ -122,8 +130,8 @@ mod tests {
         let matches = planted(&truth);
         let corners = (0..8).map(|i| [i & 1, i >> 1 & 1, i >> 2].map(f64::from)).collect();
         let cloud = PointCloud::from_points(corners);
-        let ready = || prepare(&check(&cloud, CloudRole::Cloud).unwrap(), 0.5, Described::Surely).unwrap();
-        let (source, target) = (ready(), ready());
+        let call = Call::new(None, Watch::default());
+        let (source, target) = (ready(&cloud, &call), ready(&cloud, &call));
         for finder in SOURCES.iter().filter(|s| s.needs_matches()) {
             let problem = Problem {
                 source: &source,
@@ -134,6 +142,7 @@ mod tests {
                 tolerance: 0.05,
                 seed: 1,
                 alone: true,
+                call: &call,
             };
             let best = finder.propose(&problem)[0];
             let off = separation(&best.pose, &truth, 1.0);
@@ -148,7 +157,8 @@ mod tests {
     fn no_matches_no_hypotheses() {
         let corners = (0..8).map(|i| [i & 1, i >> 1 & 1, i >> 2].map(f64::from)).collect();
         let cloud = PointCloud::from_points(corners);
-        let ready = prepare(&check(&cloud, CloudRole::Cloud).unwrap(), 0.5, Described::Surely).unwrap();
+        let call = Call::new(None, Watch::default());
+        let ready = ready(&cloud, &call);
         for finder in SOURCES.iter().filter(|s| s.needs_matches()) {
             let problem = Problem {
                 source: &ready,
@@ -159,6 +169,7 @@ mod tests {
                 tolerance: 0.05,
                 seed: 1,
                 alone: true,
+                call: &call,
             };
             assert!(finder.propose(&problem).is_empty(), "{:?}", finder.method());
         }

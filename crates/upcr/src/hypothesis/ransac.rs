@@ -17,6 +17,8 @@ const EDGE_RATIO: f32 = 0.9;
 const ROUND: usize = 4096;
 /// Trials of one random stream.
 const STREAM: usize = 512;
+/// Trials between two looks at whether to go on.
+const TRIALS_PER_LOOK: usize = 32;
 const MAX_HYPOTHESES: usize = 16;
 
 pub(super) struct Ransac;
@@ -44,8 +46,10 @@ impl HypothesisSource for Ransac {
                 .map(|stream| {
                     let mut rng = ChaCha8Rng::seed_from_u64(problem.seed);
                     rng.set_stream((trials / STREAM + stream) as u64);
-                    let mut found: Vec<Hypothesis> =
-                        (0..STREAM).filter_map(|_| trial(&matches, problem.tolerance, &mut rng)).collect();
+                    let mut found: Vec<Hypothesis> = (0..STREAM)
+                        .take_while(|i| !(i.is_multiple_of(TRIALS_PER_LOOK) && problem.call.is_over()))
+                        .filter_map(|_| trial(&matches, problem.tolerance, &mut rng))
+                        .collect();
                     found.sort_by_key(|h| std::cmp::Reverse(h.support));
                     found.truncate(MAX_HYPOTHESES);
                     found
@@ -58,9 +62,10 @@ impl HypothesisSource for Ransac {
             best.truncate(MAX_HYPOTHESES);
             let inlier_share = best.first().map_or(0.0, |h| h.support as f64 / matches.len() as f64);
             let needed = (1.0 - CONFIDENCE).ln() / (1.0 - inlier_share.powi(3)).ln();
-            if trials as f64 > needed {
+            if trials as f64 > needed || problem.call.is_over() {
                 break;
             }
+            problem.call.advance(trials as f64 / MAX_TRIALS as f64);
         }
         best
     }

@@ -98,9 +98,14 @@ impl HypothesisSource for Upcr {
             if closest >= CLOSE || passes == PASSES || (closest < FAR_OFF && !problem.alone) {
                 break;
             }
+            if problem.call.is_over() {
+                break;
+            }
             found = canonical_source(&pose);
         }
-        if passes == 0 || (closest < HOPELESS && !problem.alone) {
+        // Where the time is up, no other source will be asked either.
+        let alone = problem.alone || problem.call.ended_by().is_some();
+        if passes == 0 || (closest < HOPELESS && !alone) {
             return Vec::new();
         }
         vec![Hypothesis { pose, method: Method::Upcr, support: 0 }]

@@ -4,6 +4,7 @@ use multiversion::multiversion;
 use rayon::prelude::*;
 
 use super::{Neighbor, Neighborhoods};
+use crate::watch::IsOver;
 
 /// Points a leaf. All leaves but the last are full.
 const LEAF: usize = 16;
@@ -96,10 +97,15 @@ impl Leaf {
 impl KdTree {
     /// Indexes `points` (all finite).
     pub fn new(points: &[[f32; 3]]) -> Self {
+        Self::new_unless(points, &|| false)
+    }
+
+    /// As [`Self::new`]; of no use where `is_over`, asked now and then, said yes.
+    pub(crate) fn new_unless(points: &[[f32; 3]], is_over: IsOver) -> Self {
         let mut entries: Vec<Entry> = points.iter().copied().zip(0..).collect();
         let mut leaves = vec![Leaf::EMPTY; points.len().div_ceil(LEAF)];
         let mut splits = vec![Split::default(); leaves.len().saturating_sub(1)];
-        build(&mut entries, &mut splits, &mut leaves);
+        build(&mut entries, &mut splits, &mut leaves, is_over);
         let (min, max) = bounding_box(points.iter());
         Self { points: points.to_vec(), min, max, splits, leaves }
     }
@@ -148,19 +154,50 @@ impl KdTree {
 
     /// k-nearest lists of every indexed point (itself included), in parallel.
     pub fn knn_graph(&self, k: usize) -> Neighborhoods {
-        self.graph(f32::INFINITY, k)
+        self.graph(f32::INFINITY, k, &|| false)
     }
 
     /// Radius lists of every indexed point (itself included), at most `max` each, in parallel.
     pub fn radius_graph(&self, radius: f32, max: usize) -> Neighborhoods {
-        self.graph(radius * radius, max)
+        self.radius_graph_unless(radius, max, &|| false)
     }
 
-    fn graph(&self, radius_sq: f32, max: usize) -> Neighborhoods {
+    /// As [`Self::radius_graph`]; lists stay empty once `is_over`, asked now and then, said yes.
+    pub(crate) fn radius_graph_unless(&self, radius: f32, max: usize, is_over: IsOver) -> Neighborhoods {
+        self.graph(radius * radius, max, is_over)
+    }
+
+    /// What `of` makes of each point's index and its `k` nearest points (itself included), nearest first, in parallel:
+    /// the lists are not kept. Points are left out once `is_over`, asked now and then, said yes.
+    pub(crate) fn map_nearest<T: Clone + Default + Send>(
+        &self,
+        k: usize,
+        is_over: IsOver,
+        of: impl Fn(usize, &[Neighbor]) -> T + Sync,
+    ) -> Vec<T> {
+        let part = |leaves: &[Leaf]| -> Vec<T> {
+            if is_over() {
+                return Vec::new();
+            }
+            let lists = graph_part(self, leaves, f32::INFINITY, k);
+            let points = leaves.iter().flat_map(Leaf::indices);
+            points.enumerate().map(|(r, i)| of(i as usize, lists.row(r))).collect()
+        };
+        let parts: Vec<Vec<T>> = self.leaves.par_chunks(GRAPH_LEAVES).map(part).collect();
+        let mut all = vec![T::default(); self.len()];
+        for (leaves, part) in self.leaves.chunks(GRAPH_LEAVES).zip(parts) {
+            for (i, value) in leaves.iter().flat_map(Leaf::indices).zip(part) {
+                all[i as usize] = value;
+            }
+        }
+        all
+    }
+
+    fn graph(&self, radius_sq: f32, max: usize, is_over: IsOver) -> Neighborhoods {
         let parts: Vec<_> = self
             .leaves
             .par_chunks(GRAPH_LEAVES)
-            .map(|leaves| graph_part(self, leaves, radius_sq, max))
+            .map(|leaves| graph_part(self, leaves, radius_sq, if is_over() { 0 } else { max }))
             .collect();
 
         let mut offsets = vec![0; self.len() + 1];
@@ -236,7 +273,7 @@ impl<'a> Walk<'a> {
 }
 
 /// Sorts `entries` into `leaves`, all full but the last.
-fn build(entries: &mut [Entry], splits: &mut [Split], leaves: &mut [Leaf]) {
+fn build(entries: &mut [Entry], splits: &mut [Split], leaves: &mut [Leaf], is_over: IsOver) {
     let [root, splits @ ..] = splits else {
         if let [leaf] = leaves {
             leaf.fill(entries);
@@ -253,11 +290,14 @@ fn build(entries: &mut [Entry], splits: &mut [Split], leaves: &mut [Leaf]) {
     *root = Split { axis: axis as u32, at: median[axis] };
 
     let parallel = leaves.len() > SEQUENTIAL_LEAVES;
+    if parallel && is_over() {
+        return;
+    }
     let (entries_below, entries_above) = entries.split_at_mut(left * LEAF);
     let (splits_below, splits_above) = splits.split_at_mut(left - 1);
     let (leaves_below, leaves_above) = leaves.split_at_mut(left);
-    let mut below = || build(entries_below, splits_below, leaves_below);
-    let mut above = || build(entries_above, splits_above, leaves_above);
+    let mut below = || build(entries_below, splits_below, leaves_below, is_over);
+    let mut above = || build(entries_above, splits_above, leaves_above, is_over);
     if parallel {
         rayon::join(below, above);
     } else {

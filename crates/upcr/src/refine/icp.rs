@@ -7,7 +7,7 @@ use super::{
     Factor, LockedPose, RobustKernel,
     solver::{Correspondence, MIN_DAMPING, Objective},
 };
-use crate::{prepare::Level, refine::Refinement, transform::Rigid};
+use crate::{prepare::Level, refine::Refinement, transform::Rigid, watch::Call};
 
 /// Source points are matched in blocks of this many; the blocks' results stand in order.
 const BLOCK: usize = 256;
@@ -73,6 +73,7 @@ pub(crate) struct Icp<'a> {
     pub factor: &'a dyn Factor,
     pub kernel: RobustKernel,
     pub lock: Option<&'a LockedPose>,
+    pub call: &'a Call<'a>,
 }
 
 impl<'a> Icp<'a> {
@@ -90,6 +91,9 @@ impl<'a> Icp<'a> {
         let mut damping = MIN_DAMPING;
         let mut nearest = vec![NOTHING; moved.len()];
         for iteration in 0..schedule.max_iterations {
+            if self.call.is_over() {
+                break;
+            }
             let along = (iteration as f32 / schedule.shrink_over.max(1) as f32).min(1.0);
             let max_distance = first * (last / first).powf(along);
             let mut pairs = self.correspondences(moved, &refined.pose, max_distance, &mut nearest);
