@@ -14,6 +14,7 @@ pub mod ops;
 pub mod random;
 #[cfg(feature = "train")]
 pub mod train;
+pub mod trust;
 
 #[cfg(feature = "train")]
 pub use burn::tensor::Device;

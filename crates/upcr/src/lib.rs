@@ -3,6 +3,7 @@
 pub mod cloud;
 pub mod error;
 pub mod features;
+mod free_direction;
 mod hypothesis;
 pub mod io;
 pub mod neighbors;
@@ -18,6 +19,7 @@ mod verify;
 
 pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
+pub use free_direction::FreeDirection;
 pub use refine::{Locks, Refinement, RobustKernel};
 pub use register::register;
 pub use registration::{Reason, Registration, TRUSTWORTHY, Timings};

@@ -2,13 +2,14 @@
 
 use std::time::Instant;
 
-use nalgebra::Matrix6;
+use nalgebra::{Matrix6, Matrix6xX};
 use rayon::prelude::*;
 
 use crate::{
     CloudRole, Error, PointCloud, Result,
     cloud::orient_by_curvature,
     features::{Descriptors, Feature, FeatureInput},
+    free_direction,
     hypothesis::{Hypothesis, Match, Problem, SOURCES, are_alike, match_levels, separation},
     prepare::{Described, Level, Prepared, check, derive_voxel_size, prepare},
     refine::{Icp, LockedPose, Refined, Refinement, Schedule, factor},
@@ -16,7 +17,7 @@ use crate::{
     settings::{Method, Settings},
     threads::on_threads,
     transform::Rigid,
-    verify::{Evidence, conditioning, covariance, distances, judge, overlap_at},
+    verify::{Evidence, Uncertainty, distances, judge, overlap_at},
 };
 
 /// Hypotheses that are refined on the coarse level, and of those on the fine one.
@@ -303,19 +304,18 @@ impl<'a> Pipeline<'a> {
         let limit = self.voxel_size as f32;
         let forward = distances(source, &self.source.held_out_points(), target, pose, limit);
         let backward = distances(target, &self.target.held_out_points(), source, &pose.inverse(), limit);
-        let conditioning = conditioning(&best.refined.shape_hessian, radius);
+        let uncertainty = self.uncertainty(pose);
         let inliers = forward.within(limit) + backward.within(limit);
         let evidence = Evidence {
             overlap: [forward.share(limit), backward.share(limit)],
             inliers,
             sharpness: best.sharpness,
             runner_up,
-            conditioning,
+            free: uncertainty.free.ncols() > 0,
             converged: best.refined.converged || self.settings.refine == Refinement::None,
             points: source.points.len().min(target.points.len()),
         };
         let verdict = judge(&evidence);
-        let covariance = covariance(&best.refined.hessian, best.refined.variance, radius);
         Registration {
             T_target_source: match &self.lock {
                 Some(lock) => lock.file_pose(pose),
@@ -327,17 +327,33 @@ impl<'a> Pipeline<'a> {
             converged: evidence.converged && forward.within(limit) > 0,
             iterations: best.refined.iterations,
             probability: verdict.probability,
-            covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
+            covariance: rows(&uncertainty.covariance),
+            free_directions: free_direction::name(&uncertainty.free, radius, self.target.origin),
             reasons: verdict.reasons,
             method: best.method,
             ..self.nothing_found()
         }
     }
 
+    /// How far `pose` may be off, as the pairs of the last refinement tell.
+    fn uncertainty(&self, pose: &Rigid) -> Uncertainty {
+        let radius = f64::from(self.source.fine.radius);
+        let reach = REACH_VOXELS * self.voxel_size as f32;
+        let moved = Level::thin(&self.source.refined_points(), FINE_POINTS);
+        let icp = self.icp(&self.source.fine, &self.target.fine);
+        let tangent = match &self.lock {
+            Some(lock) => lock.tangent(pose),
+            None => Matrix6xX::identity(6),
+        };
+        match icp.information(&moved, pose, reach, self.settings.overlap.unwrap_or(1.0)) {
+            Some(information) => Uncertainty::of(&information, &tangent, radius),
+            None => Uncertainty::unknown(radius),
+        }
+    }
+
     /// The answer where no source of hypotheses had any.
     fn nothing_found(&self) -> Registration {
         let radius = f64::from(self.source.fine.radius);
-        let covariance = covariance(&Matrix6::zeros(), 0.0, radius);
         let points = self.source.fine.points.len().min(self.target.fine.points.len());
         Registration {
             T_target_source: to_file(&self.init, self.source, self.target),
@@ -347,7 +363,8 @@ impl<'a> Pipeline<'a> {
             converged: false,
             iterations: 0,
             probability: 0.0,
-            covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
+            covariance: rows(&Uncertainty::unknown(radius).covariance),
+            free_directions: Vec::new(),
             reasons: judge(&Evidence::none(points)).reasons,
             method: self.settings.method,
             voxel_size: self.voxel_size,
@@ -355,6 +372,10 @@ impl<'a> Pipeline<'a> {
             timings_ms: Timings::default(),
         }
     }
+}
+
+fn rows(m: &Matrix6<f64>) -> [[f64; 6]; 6] {
+    std::array::from_fn(|r| std::array::from_fn(|c| m[(r, c)]))
 }
 
 /// Keeps the best `count` at most, and of those only what scores nearly as well as the best.

@@ -1,20 +1,20 @@
 //! Iterative closest points, coarse to fine.
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::{
     Factor, LockedPose, RobustKernel,
     solver::{Correspondence, MIN_DAMPING, Objective},
 };
-use crate::{prepare::Level, refine::Refinement, transform::Rigid};
+use crate::{prepare::Level, transform::Rigid};
 
 /// Source points are matched in blocks of this many; the blocks' results stand in order.
 const BLOCK: usize = 256;
 /// Surfaces that face more than this far apart (cosine) are not the same surface.
 const NORMAL_COSINE: f32 = 0.5;
 /// Fewer pairs than a pose has degrees of freedom hold none.
-const FEWEST_PAIRS: usize = 6;
+pub(super) const FEWEST_PAIRS: usize = 6;
 /// No target point was near.
 const NOTHING: u32 = u32::MAX;
 /// Residuals that tell the kernel's scale.
@@ -58,12 +58,6 @@ pub(crate) struct Refined {
     pub pose: Rigid,
     pub iterations: usize,
     pub converged: bool,
-    /// Information about the pose (left twist about the target's local origin), per unit residual variance.
-    pub hessian: Matrix6<f64>,
-    /// Variance of a residual.
-    pub variance: f64,
-    /// As `hessian`, of distances along the surfaces' normals alone: what the shape itself holds.
-    pub shape_hessian: Matrix6<f64>,
 }
 
 /// Iterative closest points between two clouds.
@@ -82,9 +76,6 @@ impl<'a> Icp<'a> {
             pose: self.lock.map_or(*pose, |l| l.project(pose)),
             iterations: 0,
             converged: false,
-            hessian: Matrix6::zeros(),
-            variance: 0.0,
-            shape_hessian: Matrix6::zeros(),
         };
         let (first, last) = schedule.max_distance;
         let mut damping = MIN_DAMPING;
@@ -115,24 +106,19 @@ impl<'a> Icp<'a> {
                 break;
             }
         }
-        let mut pairs = self.correspondences(moved, &refined.pose, last, &mut nearest);
-        keep_closest(&mut pairs, &refined.pose, schedule.keep);
-        if pairs.len() < FEWEST_PAIRS {
-            refined.converged = false;
-            return refined;
-        }
-        let objective = self.objective(&pairs, &refined.pose, last);
-        let model = objective.linearize(&refined.pose, &pairs);
-        refined.hessian = model.hessian;
-        let along_normals = Objective { factor: super::factor(Refinement::Plane, false), ..objective };
-        refined.shape_hessian = along_normals.linearize(&refined.pose, &pairs).hessian;
-        refined.variance = model.residual_sq / model.weight.max(f64::MIN_POSITIVE);
         refined
+    }
+
+    /// The pairs of the points `moved` at `pose`, `reach` apart at most, the closest share `keep` of them.
+    pub(super) fn pairs(&self, moved: &[u32], pose: &Rigid, reach: f32, keep: f64) -> Vec<Correspondence> {
+        let mut pairs = self.correspondences(moved, pose, reach, &mut vec![NOTHING; moved.len()]);
+        keep_closest(&mut pairs, pose, keep);
+        pairs
     }
 
     /// What is minimised over `pairs`. The kernel's scale comes from the residuals themselves: a few robust
     /// standard deviations, within what the search radius allows.
-    fn objective(&self, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> Objective<'a> {
+    pub(super) fn objective(&self, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> Objective<'a> {
         let plain = Objective { factor: self.factor, kernel: RobustKernel::None, scale_sq: 1.0 };
         let mut squares: Vec<f64> = pairs
             .iter()

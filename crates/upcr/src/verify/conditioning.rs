@@ -1,30 +1,105 @@
-//! How firmly the geometry holds the pose.
+//! How firmly the geometry holds the pose: its covariance, and the directions that it leaves free.
 
-use nalgebra::{Matrix6, SymmetricEigen, Vector6};
+use std::f64::consts::PI;
 
-/// Covariance of the left twist (rotation rad, translation) from the information matrix.
-///
-/// A direction without information gets the variance that an uncertainty of `radius` along it would have.
-pub(crate) fn covariance(hessian: &Matrix6<f64>, variance: f64, radius: f64) -> Matrix6<f64> {
-    let scale = rotation_scale(radius);
-    let eigen = SymmetricEigen::new(scale * hessian * scale);
-    let ceiling = radius * radius;
-    let spread = eigen
-        .eigenvalues
-        .map(|information| if information > 0.0 { (variance / information).min(ceiling) } else { ceiling });
-    let q = eigen.eigenvectors;
-    scale * (q * Matrix6::from_diagonal(&spread) * q.transpose()) * scale
+use nalgebra::{DMatrix, DVector, Matrix6, Matrix6xX, SymmetricEigen, Vector6};
+
+use crate::refine::Information;
+
+/// A motion is free where both clouds' normals agree on less information about it than this many times what their
+/// errors make of it by chance, or than this share of what they agree on about the best held one.
+const BY_CHANCE: f64 = 3.0;
+const NEGLIGIBLE: f64 = 5e-4;
+/// Where this share of a slide pulls pairs apart, the samples hold the pose, whatever the shape does.
+const ADHERENT: f64 = 0.5;
+/// Residuals are taken as no better known than this share of the radius: single precision has no more.
+const ROUNDING: f64 = 1e-6;
+
+/// How far a pose may be off.
+pub(crate) struct Uncertainty {
+    /// Of the left twist (rotation rad, translation) about the target's local origin.
+    pub covariance: Matrix6<f64>,
+    /// Orthonormal basis of the twists that leave the surfaces on each other, rotations in units of 1/radius.
+    pub free: Matrix6xX<f64>,
 }
 
-/// How firmly the geometry holds the direction that it holds least: the ratio of the smallest to the largest
-/// eigenvalue of the information matrix, its rotations in units of 1/radius.
-pub(crate) fn conditioning(hessian: &Matrix6<f64>, radius: f64) -> f64 {
-    let scale = rotation_scale(radius);
-    let information = (scale * hessian * scale).symmetric_eigenvalues();
-    if information.max() > 0.0 { information.min().max(0.0) / information.max() } else { 0.0 }
+impl Uncertainty {
+    /// Of a pose that nothing is known of, between clouds of this radius: turned by any angle, moved by a radius.
+    pub fn unknown(radius: f64) -> Self {
+        let everywhere = Matrix6::from_diagonal(&prior(radius));
+        let scale = rotation_scale(radius);
+        Self { covariance: scale * everywhere * scale, free: Matrix6xX::zeros(0) }
+    }
+
+    /// Of a pose that may move along the columns of `tangent` (twists).
+    pub fn of(information: &Information, tangent: &Matrix6xX<f64>, radius: f64) -> Self {
+        // Lengths at the rim in place of angles: all six coordinates of a twist have one unit.
+        let scale = rotation_scale(radius);
+        let basis = scale.try_inverse().map_or_else(|| tangent.clone(), |rim| rim * tangent).qr().q();
+        let to_free = scale * &basis;
+        let reduced = |m: &Matrix6<f64>| to_free.transpose() * m * &to_free;
+
+        let free = if information.adherence < ADHERENT { free(information, &reduced) } else { DMatrix::zeros(basis.ncols(), 0) };
+        let held = DMatrix::identity(basis.ncols(), basis.ncols()) - &free * free.transpose();
+        let stiffness = positive(&(&held * reduced(&information.stiffness) * &held));
+        let hessian = reduced(&information.hessian);
+
+        // A sandwich (Huber 1967): pairs of one patch err together, those of different ones do not.
+        let spare = information.pairs as f64 / (information.pairs as f64 - basis.ncols() as f64).max(1.0);
+        let mut scatter = hessian * (ROUNDING * radius).powi(2);
+        for patch in &information.patches {
+            let pull = to_free.transpose() * patch.gradient;
+            scatter += &pull * pull.transpose() * spare;
+        }
+        let prior = basis.transpose() * Matrix6::from_diagonal(&prior(radius).map(f64::recip)) * &basis;
+        let precision = match scatter.cholesky() {
+            Some(scatter) => &stiffness * scatter.solve(&stiffness) + &prior,
+            None => prior,
+        };
+        let covariance = (&precision + precision.transpose()) / 2.0;
+        let covariance = covariance.cholesky().map_or_else(|| DMatrix::zeros(basis.ncols(), basis.ncols()), |c| c.inverse());
+        let full = &to_free * &covariance * to_free.transpose();
+        let full = Matrix6::from_fn(|r, c| f64::midpoint(full[(r, c)], full[(c, r)]));
+        Self { covariance: full, free: &basis * free }
+    }
 }
 
-/// Turns radians into lengths at the cloud's rim, so that all six entries have one unit.
+/// Orthonormal basis of the motions that the surfaces do not resist, in the reduced coordinates.
+fn free(information: &Information, reduced: &impl Fn(&Matrix6<f64>) -> DMatrix<f64>) -> DMatrix<f64> {
+    let agreement = reduced(&information.patches.iter().map(|p| p.agreement).sum());
+    let eigen = SymmetricEigen::new(agreement);
+    let chances: Vec<DMatrix<f64>> = information.patches.iter().map(|p| reduced(&p.disagreement)).collect();
+    let largest = eigen.eigenvalues.max();
+    let is_free = |(k, information): (usize, &f64)| {
+        let direction = eigen.eigenvectors.column(k);
+        let chance_sq: f64 = chances.iter().map(|d| direction.dot(&(d * direction)).powi(2)).sum();
+        if std::env::var_os("DEBUG_FREE").is_some() {
+            eprint!(" [{:.5} {:.1} {:.2}]", information / largest, information / chance_sq.sqrt(),
+              information / chances.iter().map(|d| direction.dot(&(d * direction))).sum::<f64>());
+        }
+        (*information <= (BY_CHANCE * chance_sq.sqrt()).max(NEGLIGIBLE * largest)).then_some(k)
+    };
+    let found: Vec<DVector<f64>> = eigen.eigenvalues.iter().enumerate().filter_map(is_free)
+        .map(|k| eigen.eigenvectors.column(k).into_owned()).collect();
+    if std::env::var_os("DEBUG_FREE").is_some() { eprintln!(" adherence {:.3}", information.adherence); }
+    if found.is_empty() { DMatrix::zeros(eigen.eigenvectors.nrows(), 0) } else { DMatrix::from_columns(&found) }
+}
+
+/// The nearest matrix without a negative eigenvalue.
+fn positive(m: &DMatrix<f64>) -> DMatrix<f64> {
+    let eigen = SymmetricEigen::new((m + m.transpose()) / 2.0);
+    let q = &eigen.eigenvectors;
+    q * DMatrix::from_diagonal(&eigen.eigenvalues.map(|v| v.max(0.0))) * q.transpose()
+}
+
+/// Variances of a pose of which nothing is known: an angle uniform over the circle, a length of a radius.
+fn prior(radius: f64) -> Vector6<f64> {
+    let length = radius * radius;
+    let angle = length * PI * PI / 3.0;
+    Vector6::new(angle, angle, angle, length, length, length)
+}
+
+/// Turns lengths at the cloud's rim into radians.
 fn rotation_scale(radius: f64) -> Matrix6<f64> {
     let r = 1.0 / radius.max(f64::MIN_POSITIVE);
     Matrix6::from_diagonal(&Vector6::new(r, r, r, 1.0, 1.0, 1.0))

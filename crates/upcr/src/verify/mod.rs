@@ -4,6 +4,6 @@ mod conditioning;
 mod overlap;
 mod verdict;
 
-pub(crate) use conditioning::{conditioning, covariance};
+pub(crate) use conditioning::Uncertainty;
 pub(crate) use overlap::{distances, overlap_at};
 pub(crate) use verdict::{Evidence, judge};

@@ -11,12 +11,6 @@ const NO_OVERLAP: f64 = 0.1;
 const LOW_OVERLAP: f64 = 0.3;
 /// A runner-up this close in score is as good an answer.
 const AMBIGUOUS_MARGIN: f64 = 0.05;
-/// Information, relative to the best held direction, under which a direction is free. Real scans of rooms,
-/// streets and statues have 0.005 and more; planes and cylinders under scanner noise less than 0.001.
-const FREE_DIRECTION: f64 = 0.0015;
-/// Residuals this small (see [`Evidence::sharpness`]) show that points were sampled once and then moved: then
-/// the samples hold the pose where the shape does not.
-const SAME_SAMPLES: f64 = 0.9;
 /// A caveat that speaks against the pose itself leaves at most this.
 const DOUBTFUL: f64 = 0.45;
 
@@ -31,8 +25,8 @@ pub(crate) struct Evidence {
     pub sharpness: f64,
     /// Score of the best clearly different pose over that of this one; 0 where there is none.
     pub runner_up: f64,
-    /// Ratio of the worst to the best held direction.
-    pub conditioning: f64,
+    /// Whether the geometry leaves some motion free.
+    pub free: bool,
     /// Whether the refinement settled.
     pub converged: bool,
     /// Points of the smaller cloud.
@@ -47,7 +41,7 @@ impl Evidence {
             inliers: 0,
             sharpness: 0.0,
             runner_up: 0.0,
-            conditioning: 0.0,
+            free: false,
             converged: true,
             points,
         }
@@ -78,7 +72,7 @@ pub(crate) fn judge(e: &Evidence) -> Verdict {
         if 1.0 - e.runner_up < AMBIGUOUS_MARGIN {
             reasons.push(Reason::Ambiguous);
         }
-        if e.conditioning < FREE_DIRECTION && e.sharpness < SAME_SAMPLES {
+        if e.free {
             reasons.push(Reason::DegenerateAxis);
         }
     }
@@ -118,7 +112,7 @@ mod tests {
         inliers: 1000,
         sharpness: 0.75,
         runner_up: 0.5,
-        conditioning: 0.02,
+        free: false,
         converged: true,
         points: 5000,
     };
@@ -136,7 +130,7 @@ mod tests {
             (Evidence { inliers: 5, ..GOOD }, Reason::TooFewPoints),
             (Evidence { overlap: [0.2, 0.2], ..GOOD }, Reason::LowOverlap),
             (Evidence { runner_up: 0.99, ..GOOD }, Reason::Ambiguous),
-            (Evidence { conditioning: 1e-5, ..GOOD }, Reason::DegenerateAxis),
+            (Evidence { free: true, ..GOOD }, Reason::DegenerateAxis),
             (Evidence { points: 20, ..GOOD }, Reason::TooFewPoints),
             (Evidence { sharpness: 0.3, ..GOOD }, Reason::PoorFit),
         ];

@@ -1,0 +1,4 @@
+//! Whether what a registration says about itself is true.
+
+pub mod covariance;
+pub mod free_axes;
