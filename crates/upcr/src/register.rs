@@ -338,14 +338,19 @@ impl<'a> Pipeline<'a> {
     /// How far `pose` may be off, as the pairs of the last refinement tell.
     fn uncertainty(&self, pose: &Rigid) -> Uncertainty {
         let radius = f64::from(self.source.fine.radius);
-        let reach = REACH_VOXELS * self.voxel_size as f32;
         let moved = Level::thin(&self.source.refined_points(), FINE_POINTS);
         let icp = self.icp(&self.source.fine, &self.target.fine);
+        let reach = REACH_VOXELS * self.voxel_size as f32;
+        let mut schedule = Schedule::settled(reach, self.settings.overlap.unwrap_or(1.0));
+        if self.settings.refine == Refinement::None {
+            // What was never refined may lie further off.
+            schedule.max_slide_voxels = f32::INFINITY;
+        }
         let tangent = match &self.lock {
             Some(lock) => lock.tangent(pose),
             None => Matrix6xX::identity(6),
         };
-        match icp.information(&moved, pose, reach, self.settings.overlap.unwrap_or(1.0)) {
+        match icp.information(&moved, pose, &schedule) {
             Some(information) => Uncertainty::of(&information, &tangent, radius),
             None => Uncertainty::unknown(radius),
         }

@@ -19,6 +19,8 @@ pub(super) const FEWEST_PAIRS: usize = 6;
 const NOTHING: u32 = u32::MAX;
 /// Residuals that tell the kernel's scale.
 const SCALE_SAMPLE: usize = 1024;
+/// See [`Schedule::max_slide_voxels`].
+const MAX_SLIDE_VOXELS: f32 = 0.75;
 /// Motion in voxels, at the target's rim, under which the pose has settled.
 const SETTLED_VOXELS: f64 = 1e-2;
 
@@ -33,22 +35,32 @@ pub(crate) struct Schedule {
     pub max_iterations: usize,
     /// Share of the closest pairs that is kept.
     pub keep: f64,
+    /// Once the distance is at its last, pairs this many voxels apart along the surface are no pairs either: averages
+    /// of cells have a partner nearer than that, unless the other scan ends there.
+    pub max_slide_voxels: f32,
 }
 
 impl Schedule {
     /// A few steps at a coarse level, whose pairs are `reach` apart at most.
     pub fn coarse(reach: f32) -> Self {
-        Self { max_distance: (2.0 * reach, reach), shrink_over: 4, max_iterations: 6, keep: 1.0 }
+        Self {
+            max_distance: (2.0 * reach, reach),
+            shrink_over: 4,
+            max_iterations: 6,
+            keep: 1.0,
+            max_slide_voxels: f32::INFINITY,
+        }
     }
 
     /// Until the pose settles, from pairs `first` apart to pairs `reach` apart.
     pub fn fine(first: f32, reach: f32, keep: f64) -> Self {
-        Self { max_distance: (first, reach), shrink_over: 6, max_iterations: 30, keep }
+        let max_slide_voxels = MAX_SLIDE_VOXELS;
+        Self { max_distance: (first, reach), shrink_over: 6, max_iterations: 30, keep, max_slide_voxels }
     }
 
     /// A few last steps with pairs `reach` apart at most.
     pub fn settled(reach: f32, keep: f64) -> Self {
-        Self { max_distance: (reach, reach), shrink_over: 1, max_iterations: 4, keep }
+        Self { shrink_over: 1, max_iterations: 4, ..Self::fine(reach, reach, keep) }
     }
 }
 
@@ -83,7 +95,9 @@ impl<'a> Icp<'a> {
         for iteration in 0..schedule.max_iterations {
             let along = (iteration as f32 / schedule.shrink_over.max(1) as f32).min(1.0);
             let max_distance = first * (last / first).powf(along);
-            let mut pairs = self.correspondences(moved, &refined.pose, max_distance, &mut nearest);
+            let max_slide = if along < 1.0 { f32::INFINITY } else { self.max_slide(schedule) };
+            let mut pairs =
+                self.correspondences(moved, &refined.pose, max_distance, max_slide, &mut nearest);
             keep_closest(&mut pairs, &refined.pose, schedule.keep);
             if pairs.len() < FEWEST_PAIRS {
                 refined.converged = false;
@@ -109,11 +123,19 @@ impl<'a> Icp<'a> {
         refined
     }
 
-    /// The pairs of the points `moved` at `pose`, `reach` apart at most, the closest share `keep` of them.
-    pub(super) fn pairs(&self, moved: &[u32], pose: &Rigid, reach: f32, keep: f64) -> Vec<Correspondence> {
-        let mut pairs = self.correspondences(moved, pose, reach, &mut vec![NOTHING; moved.len()]);
-        keep_closest(&mut pairs, pose, keep);
+    /// The pairs of the points `moved` at `pose` as the last iteration of `schedule` makes them.
+    pub(super) fn last_pairs(&self, moved: &[u32], pose: &Rigid, schedule: &Schedule) -> Vec<Correspondence> {
+        let mut nearest = vec![NOTHING; moved.len()];
+        let (_, reach) = schedule.max_distance;
+        let mut pairs = self.correspondences(moved, pose, reach, self.max_slide(schedule), &mut nearest);
+        keep_closest(&mut pairs, pose, schedule.keep);
         pairs
+    }
+
+    /// How far apart along the surface pairs may be in the end; samples as they were taken may be any distance apart.
+    fn max_slide(&self, schedule: &Schedule) -> f32 {
+        let averaged = !(self.source.sparse && self.target.sparse);
+        if averaged { schedule.max_slide_voxels * self.target.voxel_size } else { f32::INFINITY }
     }
 
     /// What is minimised over `pairs`. The kernel's scale comes from the residuals themselves: a few robust
@@ -141,6 +163,7 @@ impl<'a> Icp<'a> {
         moved: &[u32],
         pose: &Rigid,
         max_distance: f32,
+        max_slide: f32,
         nearest: &mut [u32],
     ) -> Vec<Correspondence> {
         let (source, target) = (self.source, self.target);
@@ -162,14 +185,19 @@ impl<'a> Icp<'a> {
                     *nearest = neighbor.map_or(NOTHING, |n| n.index);
                     let Some(neighbor) = neighbor else { continue };
                     let (m, n) = (source.normals[i as usize], target.normals[neighbor.index as usize]);
-                    if (rotation * Vector3::from(m)).dot(&Vector3::from(n)).abs() < NORMAL_COSINE {
+                    let (q, n) = (Vector3::from(target.points[neighbor.index as usize]), Vector3::from(n));
+                    if (rotation * Vector3::from(m)).dot(&n).abs() < NORMAL_COSINE {
+                        continue;
+                    }
+                    let across = n.dot(&(y - q));
+                    if (y - q).norm_squared() - across * across > max_slide * max_slide {
                         continue;
                     }
                     found.push(Correspondence {
                         source: p,
-                        target: target.points[neighbor.index as usize],
+                        target: q.into(),
                         source_normal: m,
-                        target_normal: n,
+                        target_normal: n.into(),
                     });
                 }
                 found

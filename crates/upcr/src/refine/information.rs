@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
 use rayon::prelude::*;
 
 use super::{
-    Icp,
+    Icp, Schedule,
     icp::FEWEST_PAIRS,
     solver::{Correspondence, Objective},
 };
@@ -49,20 +49,21 @@ pub(crate) struct Patch {
 }
 
 impl Icp<'_> {
-    /// What the points `moved` of the source say about `pose`, paired as the last iteration of a refinement pairs them
-    /// (`reach`, `keep`); `None` where they are too few.
-    pub fn information(&self, moved: &[u32], pose: &Rigid, reach: f32, keep: f64) -> Option<Information> {
-        let pairs = self.pairs(moved, pose, reach, keep);
+    /// What the points `moved` of the source say about `pose`, paired as the last iteration of `schedule` pairs them;
+    /// `None` where they are too few.
+    pub fn information(&self, moved: &[u32], pose: &Rigid, schedule: &Schedule) -> Option<Information> {
+        let pairs = self.last_pairs(moved, pose, schedule);
+        let (_, reach) = schedule.max_distance;
         if pairs.len() < FEWEST_PAIRS {
             return None;
         }
         let surface = Surface {
             objective: self.objective(&pairs, pose, reach),
             pose,
-            adherence: if self.source.sparse && self.target.sparse { self.adherence(&pairs, pose, reach) } else { 0.0 },
+            adherence: self.adherence(&pairs, pose, reach),
             normal_variance: normal_variance(&pairs, pose),
         };
-        let patches: Vec<Patch> = patches(&pairs, PATCH_VOXELS * f64::from(self.target.voxel_size))
+        let patches: Vec<Patch> = patches(&pairs, std::env::var("PATCH").map_or(PATCH_VOXELS, |v| v.parse().unwrap()) * f64::from(self.target.voxel_size))
             .par_iter()
             .with_min_len(16)
             .map(|patch| surface.patch(patch.iter().map(|&i| &pairs[i as usize])))
@@ -73,28 +74,31 @@ impl Icp<'_> {
             hessian: sum(|p| p.hessian),
             gradient: patches.iter().map(|p| p.gradient).sum(),
             pairs: pairs.len(),
-            adherence: surface.adherence,
+            adherence: surface.adherence[0],
             patches,
         })
     }
 
     /// See [`Information::adherence`].
-    fn adherence(&self, pairs: &[Correspondence], pose: &Rigid, reach: f32) -> f64 {
+    fn adherence(&self, pairs: &[Correspondence], pose: &Rigid, reach: f32) -> [f64; 2] {
         let step = SLIDE_VOXELS * f64::from(self.target.voxel_size);
         let sample: Vec<&Correspondence> = pairs.iter().step_by(pairs.len().div_ceil(SLID_PAIRS)).collect();
         let stays = |c: &&Correspondence| {
             let n = Vector3::from(c.target_normal.map(f64::from));
-            let slide = n.cross(&Vector3::ith(n.iamin(), 1.0)).try_normalize(0.0)? * step;
+            let along = n.cross(&Vector3::ith(n.iamin(), 1.0)).try_normalize(0.0)?;
             let y = pose.rotation * Vector3::from(c.source.map(f64::from)) + pose.translation;
             let nearest = |y: Vector3<f64>| {
                 let found = self.target.tree.nearest(y.map(|v| v as f32).into(), reach * reach)?;
                 Some(Vector3::from(self.target.points[found.index as usize].map(f64::from)))
             };
-            let follows = (nearest(y + slide)? - nearest(y - slide)?).dot(&slide) / (2.0 * step * step);
-            Some(1.0 - follows)
+            let stays = |way: Vector3<f64>| {
+                let slide = way * step;
+                Some(1.0 - (nearest(y + slide)? - nearest(y - slide)?).dot(&way) / (2.0 * step))
+            };
+            Some([stays(along)?, stays(n)?])
         };
-        let stays: Vec<f64> = sample.par_iter().with_min_len(64).filter_map(stays).collect();
-        (stays.iter().sum::<f64>() / stays.len().max(1) as f64).clamp(0.0, 1.0)
+        let stays: Vec<[f64; 2]> = sample.par_iter().with_min_len(64).filter_map(stays).collect();
+        [0, 1].map(|k| (stays.iter().map(|s| s[k]).sum::<f64>() / stays.len().max(1) as f64).clamp(0.0, 1.0))
     }
 }
 
@@ -102,7 +106,8 @@ impl Icp<'_> {
 struct Surface<'a> {
     objective: Objective<'a>,
     pose: &'a Rigid,
-    adherence: f64,
+    /// Along the surface, and across it.
+    adherence: [f64; 2],
     /// Variance of a mean normal of a pair, along either direction across it.
     normal_variance: f64,
 }
@@ -129,9 +134,10 @@ impl Surface<'_> {
             let across = (n + m).try_normalize(0.0).unwrap_or(n);
             let held = across * across.transpose();
             let firmly = across.dot(&(pull.derivative * across));
-            let along = (Matrix3::identity() - held) * (firmly * self.normal_variance * (1.0 - self.adherence));
             let rest = pull.derivative - held * firmly;
-            add(&mut sum.stiffness, &y, &(held * firmly - along + rest * self.adherence));
+            let [along_adherence, across_adherence] = self.adherence;
+            let faked = (Matrix3::identity() - held) * (firmly * self.normal_variance * (across_adherence - along_adherence).max(0.0));
+            add(&mut sum.stiffness, &y, &(held * firmly * across_adherence - faked + rest * along_adherence));
         }
         sum
     }

@@ -11,7 +11,7 @@ use crate::refine::Information;
 const BY_CHANCE: f64 = 3.0;
 const NEGLIGIBLE: f64 = 5e-4;
 /// Where this share of a slide pulls pairs apart, the samples hold the pose, whatever the shape does.
-const ADHERENT: f64 = 0.5;
+const ADHERENT: f64 = 0.3;
 /// Residuals are taken as no better known than this share of the radius: single precision has no more.
 const ROUNDING: f64 = 1e-6;
 
@@ -45,11 +45,26 @@ impl Uncertainty {
         let hessian = reduced(&information.hessian);
 
         // A sandwich (Huber 1967): pairs of one patch err together, those of different ones do not.
-        let spare = information.pairs as f64 / (information.pairs as f64 - basis.ncols() as f64).max(1.0);
-        let mut scatter = hessian * (ROUNDING * radius).powi(2);
+        let mut scatter = &hessian * (ROUNDING * radius).powi(2);
         for patch in &information.patches {
             let pull = to_free.transpose() * patch.gradient;
-            scatter += &pull * pull.transpose() * spare;
+            scatter += &pull * pull.transpose();
+        }
+        let (patches, unknowns) = (information.patches.len() as f64, basis.ncols() as f64);
+        // The pose has taken its share of each patch's error, and of the estimate of it.
+        scatter *= (patches / (patches - unknowns).max(1.0)).powi(2);
+        // What the refinement has left to do (nothing, where it has settled): the step itself, and as much doubt about
+        // the rest as makes a step of that length an ordinary error.
+        let pull = to_free.transpose() * information.gradient;
+        let unfinished = scatter.clone().cholesky().map_or(0.0, |s| pull.dot(&s.solve(&pull)));
+        if std::env::var_os("NOUNF").is_none() { scatter *= 1.0 + unfinished / unknowns; }
+        scatter += &pull * pull.transpose();
+        if std::env::var_os("DEBUG_COV").is_some() {
+            let g = to_free.transpose() * information.gradient;
+            let (v, h, k) = (scatter.clone(), stiffness.clone(), hessian.clone());
+            let d = v.clone().cholesky().map_or(0.0, |c| g.dot(&c.solve(&g)));
+            eprintln!("  DBG unfinished {d:.3} adherence {:.2} patches {} pairs {} spectrum {:.4?} ratio {:.2?}", information.adherence, information.patches.len(), information.pairs,
+             h.symmetric_eigenvalues().as_slice(), (0..6).map(|i| h[(i,i)]/k[(i,i)]).collect::<Vec<_>>());
         }
         let prior = basis.transpose() * Matrix6::from_diagonal(&prior(radius).map(f64::recip)) * &basis;
         let precision = match scatter.cholesky() {
