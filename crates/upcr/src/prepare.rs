@@ -65,6 +65,8 @@ pub(crate) struct Level {
     pub radius: f32,
     /// Whether the points are samples as they were taken, not averages of many.
     pub sparse: bool,
+    /// Whether there is one point a cell, so that none of the surface is far from one.
+    pub gridded: bool,
     /// Neighbourhoods that features look at, where they were needed already.
     graph: Option<Neighborhoods>,
 }
@@ -270,7 +272,7 @@ impl Level {
         let points: Vec<[f32; 3]> = grid.cells.iter().map(|c| c.mean().map(|v| v as f32)).collect();
         let total: f64 = grid.cells.iter().map(|c| c.count).sum();
         if total < DENSE_CELL * points.len() as f64 {
-            return Self::sparse(points, voxel_size, described);
+            return Self { gridded: true, ..Self::sparse(points, voxel_size, described) };
         }
         let (tree, normals) = rayon::join(
             || KdTree::new(&points),
@@ -282,7 +284,7 @@ impl Level {
                     .collect::<Vec<_>>()
             },
         );
-        Self::new(points, normals, tree, voxel_size)
+        Self { gridded: true, ..Self::new(points, normals, tree, voxel_size) }
     }
 
     fn new(points: Vec<[f32; 3]>, normals: Vec<[f32; 3]>, tree: KdTree, voxel_size: f64) -> Self {
@@ -294,6 +296,7 @@ impl Level {
             voxel_size: voxel_size as f32,
             radius: radius_sq.sqrt(),
             sparse: false,
+            gridded: false,
             graph: None,
         }
     }

@@ -132,10 +132,9 @@ impl<'a> Icp<'a> {
         pairs
     }
 
-    /// How far apart along the surface pairs may be in the end; samples as they were taken may be any distance apart.
+    /// How far apart along the surface pairs may be in the end; samples as they were taken may lie anywhere.
     fn max_slide(&self, schedule: &Schedule) -> f32 {
-        let averaged = !(self.source.sparse && self.target.sparse);
-        if averaged { schedule.max_slide_voxels * self.target.voxel_size } else { f32::INFINITY }
+        if self.target.gridded { schedule.max_slide_voxels * self.target.voxel_size } else { f32::INFINITY }
     }
 
     /// What is minimised over `pairs`. The kernel's scale comes from the residuals themselves: a few robust

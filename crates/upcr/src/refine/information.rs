@@ -98,7 +98,10 @@ impl Icp<'_> {
             Some([stays(along)?, stays(n)?])
         };
         let stays: Vec<[f64; 2]> = sample.par_iter().with_min_len(64).filter_map(stays).collect();
-        [0, 1].map(|k| (stays.iter().map(|s| s[k]).sum::<f64>() / stays.len().max(1) as f64).clamp(0.0, 1.0))
+        let mean = |k: usize| stays.iter().map(|s| s[k]).sum::<f64>() / stays.len().max(1) as f64;
+        // Of averages over cells the ones that are paired were chosen for being near: these follow less than all do.
+        let along = if self.source.gridded || self.target.gridded { 0.0 } else { mean(0) };
+        [along.clamp(0.0, 1.0), mean(1).clamp(0.0, 1.0)]
     }
 }
 

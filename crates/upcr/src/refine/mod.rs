@@ -13,7 +13,7 @@ mod robust;
 mod solver;
 
 pub(crate) use icp::{Icp, Refined, Schedule};
-pub(crate) use information::Information;
+pub(crate) use information::{Information, Patch};
 pub(crate) use lock::LockedPose;
 pub use lock::Locks;
 pub use robust::RobustKernel;

@@ -4,11 +4,11 @@ use std::f64::consts::PI;
 
 use nalgebra::{DMatrix, DVector, Matrix6, Matrix6xX, SymmetricEigen, Vector6};
 
-use crate::refine::Information;
+use crate::refine::{Information, Patch};
 
-/// A motion is free where both clouds' normals agree on less information about it than this many times what their
-/// errors make of it by chance, or than this share of what they agree on about the best held one.
-const BY_CHANCE: f64 = 3.0;
+/// A motion is free where both clouds' normals agree on less information about it than this share of what their errors
+/// alone would feign, or than this share of what they agree on about the best held one.
+const BY_CHANCE: f64 = 0.5;
 const NEGLIGIBLE: f64 = 5e-4;
 /// Where this share of a slide pulls pairs apart, the samples hold the pose, whatever the shape does.
 const ADHERENT: f64 = 0.3;
@@ -81,22 +81,26 @@ impl Uncertainty {
 
 /// Orthonormal basis of the motions that the surfaces do not resist, in the reduced coordinates.
 fn free(information: &Information, reduced: &impl Fn(&Matrix6<f64>) -> DMatrix<f64>) -> DMatrix<f64> {
-    let agreement = reduced(&information.patches.iter().map(|p| p.agreement).sum());
+    let sum = |of: fn(&Patch) -> Matrix6<f64>| reduced(&information.patches.iter().map(of).sum());
+    let (agreement, disagreement) = (sum(|p| p.agreement), sum(|p| p.disagreement));
     let eigen = SymmetricEigen::new(agreement);
-    let chances: Vec<DMatrix<f64>> = information.patches.iter().map(|p| reduced(&p.disagreement)).collect();
     let largest = eigen.eigenvalues.max();
-    let is_free = |(k, information): (usize, &f64)| {
+    let is_free = |(k, agreed): (usize, &f64)| {
         let direction = eigen.eigenvectors.column(k);
-        let chance_sq: f64 = chances.iter().map(|d| direction.dot(&(d * direction)).powi(2)).sum();
+        let by_chance = direction.dot(&(&disagreement * direction));
         if std::env::var_os("DEBUG_FREE").is_some() {
-            eprint!(" [{:.5} {:.1} {:.2}]", information / largest, information / chance_sq.sqrt(),
-              information / chances.iter().map(|d| direction.dot(&(d * direction))).sum::<f64>());
+            eprint!(" [{:.5} {:.2}]", agreed / largest, agreed / by_chance);
         }
-        (*information <= (BY_CHANCE * chance_sq.sqrt()).max(NEGLIGIBLE * largest)).then_some(k)
+        (*agreed <= (BY_CHANCE * by_chance).max(NEGLIGIBLE * largest)).then_some(k)
     };
-    let found: Vec<DVector<f64>> = eigen.eigenvalues.iter().enumerate().filter_map(is_free)
-        .map(|k| eigen.eigenvectors.column(k).into_owned()).collect();
-    if std::env::var_os("DEBUG_FREE").is_some() { eprintln!(" adherence {:.3}", information.adherence); }
+    let found: Vec<DVector<f64>> = eigen
+        .eigenvalues
+        .iter()
+        .enumerate()
+        .filter_map(is_free)
+        .map(|k| eigen.eigenvectors.column(k).into_owned())
+        .collect();
+    if std::env::var_os("DEBUG_FREE").is_some() { eprintln!(" adherence {:.3} pairs {}", information.adherence, information.pairs); }
     if found.is_empty() { DMatrix::zeros(eigen.eigenvectors.nrows(), 0) } else { DMatrix::from_columns(&found) }
 }
 
