@@ -13,20 +13,18 @@ use crate::transform::Rigid;
 /// Edge of a patch in voxels. Errors of pairs in one patch may have one cause (a target point that serves several
 /// source points, normals from common neighbours); those of different patches are taken as independent.
 const PATCH_VOXELS: f64 = 4.0;
-/// Pairs that tell the adherence, and how far they are slid, in voxels.
-const SLID_PAIRS: usize = 512;
-const SLIDE_VOXELS: f64 = 0.15;
+/// Pairs that tell the adherence, and how far they are moved, in voxels: no further than poses err.
+const MOVED_PAIRS: usize = 512;
+const MOVE_VOXELS: f64 = 0.15;
 
 /// All in the left twist (rotation rad, translation) about the target's local origin.
 pub(crate) struct Information {
-    /// Derivative of the mean force by the pose: pairs that a motion tears apart resist it, pairs that it re-forms do not.
+    /// Derivative of the gradient by the pose, pairs re-forming as it moves.
     pub stiffness: Matrix6<f64>,
-    /// The same as the last step of the refinement saw it, its pairs held together.
+    /// The same as the steps of the refinement see it, pairs and weights held.
     pub hessian: Matrix6<f64>,
     /// Gradient of the cost; zero where the refinement has settled.
     pub gradient: Vector6<f64>,
-    /// Number of pairs.
-    pub pairs: usize,
     /// Share of a small slide along the surface that pulls pairs apart instead of re-forming them: near 1 where both
     /// clouds hold the same samples, near 0 where each has its own.
     pub adherence: f64,
@@ -44,8 +42,24 @@ pub(crate) struct Patch {
     pub agreement: Matrix6<f64>,
     /// Σ (a − b) (a − b)ᵀ / 2: what the normals' errors alone make of it.
     pub disagreement: Matrix6<f64>,
-    stiffness: Matrix6<f64>,
-    hessian: Matrix6<f64>,
+    /// The part of [`Information::stiffness`].
+    pub stiffness: Matrix6<f64>,
+    /// The part of [`Information::hessian`].
+    pub hessian: Matrix6<f64>,
+}
+
+impl Information {
+    /// The sums over all patches.
+    pub fn of(patches: Vec<Patch>, adherence: f64) -> Self {
+        let sum = |of: fn(&Patch) -> Matrix6<f64>| patches.iter().map(of).sum();
+        Self {
+            stiffness: sum(|p| p.stiffness),
+            hessian: sum(|p| p.hessian),
+            gradient: patches.iter().map(|p| p.gradient).sum(),
+            adherence,
+            patches,
+        }
+    }
 }
 
 impl Icp<'_> {
@@ -63,45 +77,39 @@ impl Icp<'_> {
             adherence: self.adherence(&pairs, pose, reach),
             normal_variance: normal_variance(&pairs, pose),
         };
-        let patches: Vec<Patch> = patches(&pairs, std::env::var("PATCH").map_or(PATCH_VOXELS, |v| v.parse().unwrap()) * f64::from(self.target.voxel_size))
+        let patches: Vec<Patch> = patches(&pairs, PATCH_VOXELS * f64::from(self.target.voxel_size))
             .par_iter()
             .with_min_len(16)
             .map(|patch| surface.patch(patch.iter().map(|&i| &pairs[i as usize])))
             .collect();
-        let sum = |of: fn(&Patch) -> Matrix6<f64>| patches.iter().map(of).sum::<Matrix6<f64>>();
-        Some(Information {
-            stiffness: sum(|p| p.stiffness),
-            hessian: sum(|p| p.hessian),
-            gradient: patches.iter().map(|p| p.gradient).sum(),
-            pairs: pairs.len(),
-            adherence: surface.adherence[0],
-            patches,
-        })
+        Some(Information::of(patches, surface.adherence[0]))
     }
 
-    /// See [`Information::adherence`].
+    /// Share of a small motion of the source that pulls pairs apart instead of re-forming them: along the surface
+    /// and across it.
     fn adherence(&self, pairs: &[Correspondence], pose: &Rigid, reach: f32) -> [f64; 2] {
-        let step = SLIDE_VOXELS * f64::from(self.target.voxel_size);
-        let sample: Vec<&Correspondence> = pairs.iter().step_by(pairs.len().div_ceil(SLID_PAIRS)).collect();
-        let stays = |c: &&Correspondence| {
+        let step = MOVE_VOXELS * f64::from(self.target.voxel_size);
+        let nearest = |y: Vector3<f64>| {
+            let found = self.target.tree.nearest(y.map(|v| v as f32).into(), reach * reach)?;
+            Some(Vector3::from(self.target.points[found.index as usize].map(f64::from)))
+        };
+        let pulled_apart = |c: &Correspondence| {
             let n = Vector3::from(c.target_normal.map(f64::from));
             let along = n.cross(&Vector3::ith(n.iamin(), 1.0)).try_normalize(0.0)?;
             let y = pose.rotation * Vector3::from(c.source.map(f64::from)) + pose.translation;
-            let nearest = |y: Vector3<f64>| {
-                let found = self.target.tree.nearest(y.map(|v| v as f32).into(), reach * reach)?;
-                Some(Vector3::from(self.target.points[found.index as usize].map(f64::from)))
+            let share = |way: Vector3<f64>| {
+                let follows = nearest(y + way * step)? - nearest(y - way * step)?;
+                Some(1.0 - follows.dot(&way) / (2.0 * step))
             };
-            let stays = |way: Vector3<f64>| {
-                let slide = way * step;
-                Some(1.0 - (nearest(y + slide)? - nearest(y - slide)?).dot(&way) / (2.0 * step))
-            };
-            Some([stays(along)?, stays(n)?])
+            Some([share(along)?, share(n)?])
         };
-        let stays: Vec<[f64; 2]> = sample.par_iter().with_min_len(64).filter_map(stays).collect();
-        let mean = |k: usize| stays.iter().map(|s| s[k]).sum::<f64>() / stays.len().max(1) as f64;
-        // Of averages over cells the ones that are paired were chosen for being near: these follow less than all do.
+        let sample: Vec<&Correspondence> = pairs.iter().step_by(pairs.len().div_ceil(MOVED_PAIRS)).collect();
+        let shares: Vec<[f64; 2]> =
+            sample.par_iter().with_min_len(64).filter_map(|c| pulled_apart(c)).collect();
+        let mean = |k: usize| shares.iter().map(|s| s[k]).sum::<f64>() / shares.len().max(1) as f64;
+        // Averages over cells are paired where they happen to be near: these follow less than all of them would.
         let along = if self.source.gridded || self.target.gridded { 0.0 } else { mean(0) };
-        [along.clamp(0.0, 1.0), mean(1).clamp(0.0, 1.0)]
+        [along, mean(1)].map(|share| share.clamp(0.0, 1.0))
     }
 }
 
@@ -109,7 +117,7 @@ impl Icp<'_> {
 struct Surface<'a> {
     objective: Objective<'a>,
     pose: &'a Rigid,
-    /// Along the surface, and across it.
+    /// See [`Icp::adherence`].
     adherence: [f64; 2],
     /// Variance of a mean normal of a pair, along either direction across it.
     normal_variance: f64,
@@ -137,10 +145,11 @@ impl Surface<'_> {
             let across = (n + m).try_normalize(0.0).unwrap_or(n);
             let held = across * across.transpose();
             let firmly = across.dot(&(pull.derivative * across));
-            let rest = pull.derivative - held * firmly;
-            let [along_adherence, across_adherence] = self.adherence;
-            let faked = (Matrix3::identity() - held) * (firmly * self.normal_variance * (across_adherence - along_adherence).max(0.0));
-            add(&mut sum.stiffness, &y, &(held * firmly * across_adherence - faked + rest * along_adherence));
+            // Of what the factor says of motions along the surface, some is the errors of `across`.
+            let feigned = (Matrix3::identity() - held) * (firmly * self.normal_variance);
+            let (rest, [along, stays]) = (pull.derivative - held * firmly, self.adherence);
+            let stiffness = held * firmly * stays - feigned * (stays - along).max(0.0) + rest * along;
+            add(&mut sum.stiffness, &y, &stiffness);
         }
         sum
     }

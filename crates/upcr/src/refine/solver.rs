@@ -59,7 +59,7 @@ struct Residual {
 }
 
 /// Force on the moved point of a pair, the gradient of half its cost.
-pub(super) struct Pull {
+pub(crate) struct Pull {
     pub force: Vector3<f64>,
     /// Its derivative by the point, weights held.
     pub hessian: Matrix3<f64>,
