@@ -50,6 +50,9 @@ struct Fit {
     /// Threads to use [default: all]; only the time depends on it
     #[arg(long, value_name = "N")]
     threads: Option<std::num::NonZeroUsize>,
+    /// Also write what was seen of every pair, a JSON object a line
+    #[arg(long, value_name = "FILE")]
+    observed: Option<PathBuf>,
     /// The calibration, for `upcr register --calibration`
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
@@ -110,7 +113,9 @@ fn name(path: &Path) -> String {
 }
 
 fn run_fit(args: &Fit) -> Result<ExitCode> {
-    output::check_folder(&args.out)?;
+    for path in args.observed.iter().chain([&args.out]) {
+        output::check_folder(path)?;
+    }
     let mut observed = Vec::new();
     let mut sources = Vec::new();
     let mut add = |name: String, material: &Material| -> Result<()> {
@@ -128,6 +133,10 @@ fn run_fit(args: &Fit) -> Result<ExitCode> {
         let scenes = Material::virtual_scenes(args.seed, args.scenes)?;
         drop(progress);
         add(format!("{} virtual scenes", args.scenes), &scenes)?;
+    }
+    if let Some(path) = &args.observed {
+        let lines: Vec<String> = observed.iter().map(serde_json::to_string).collect::<Result<_, _>>()?;
+        write_atomically(path, (lines.join("\n") + "\n").as_bytes())?;
     }
     anyhow::ensure!(!observed.is_empty(), "no pairs to fit to: name data sets, or take virtual scenes");
     let about = format!(

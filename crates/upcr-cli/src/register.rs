@@ -342,6 +342,9 @@ fn summary(found: &Registration, args: &Args, source: &Path, target: &Path) -> S
             other.relative_score
         );
     }
+    for direction in &found.free_directions {
+        let _ = writeln!(text, "free         {direction}");
+    }
     let _ = writeln!(
         text,
         "fitness      {:.4} ({} points within one voxel of the target, rmse {:.6})",

@@ -3,6 +3,7 @@
 pub mod cloud;
 pub mod error;
 pub mod features;
+mod free_direction;
 mod hypothesis;
 pub mod io;
 mod memory;
@@ -20,6 +21,7 @@ mod watch;
 
 pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
+pub use free_direction::FreeDirection;
 pub use refine::{Locks, Refinement, RobustKernel};
 pub use register::{register, register_watched};
 pub use registration::{Alternative, Reason, Registration, TRUSTWORTHY, Timings};

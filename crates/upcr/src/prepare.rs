@@ -91,6 +91,8 @@ pub(crate) struct Level {
     pub radius: f32,
     /// Whether the points are samples as they were taken, not averages of many.
     pub sparse: bool,
+    /// Whether there is one point a cell, so that none of the surface is far from one.
+    pub gridded: bool,
     /// Neighbourhoods that features look at, where they were needed already.
     graph: Option<Neighborhoods>,
 }
@@ -311,7 +313,7 @@ impl Level {
         let points: Vec<[f32; 3]> = grid.cells.iter().map(|c| c.mean().map(|v| v as f32)).collect();
         let total: f64 = grid.cells.iter().map(|c| c.count).sum();
         if total < DENSE_CELL * points.len() as f64 {
-            return Self::sparse(points, voxel_size, described, call);
+            return Ok(Self { gridded: true, ..Self::sparse(points, voxel_size, described, call)? });
         }
         let (tree, normals) = rayon::join(
             || KdTree::new_unless(&points, &|| call.is_over()),
@@ -324,7 +326,7 @@ impl Level {
             },
         );
         call.go_on()?;
-        Ok(Self::new(points, normals, tree, voxel_size))
+        Ok(Self { gridded: true, ..Self::new(points, normals, tree, voxel_size) })
     }
 
     fn new(points: Vec<[f32; 3]>, normals: Vec<[f32; 3]>, tree: KdTree, voxel_size: f64) -> Self {
@@ -336,6 +338,7 @@ impl Level {
             voxel_size: voxel_size as f32,
             radius: radius_sq.sqrt(),
             sparse: false,
+            gridded: false,
             graph: None,
         }
     }

@@ -3,13 +3,14 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use nalgebra::Matrix6;
+use nalgebra::{Matrix6, Matrix6xX};
 use rayon::prelude::*;
 
 use crate::{
     CloudRole, PointCloud, Result,
     cloud::orient_by_curvature,
     features::{Descriptors, Feature, FeatureInput},
+    free_direction,
     hypothesis::{Hypothesis, Match, Problem, SOURCES, are_alike, match_levels, separation, turned},
     memory::most_cells,
     prepare::{Described, Level, Prepared, check, derive_voxel_size, prepare},
@@ -18,9 +19,7 @@ use crate::{
     settings::{Method, Settings},
     threads::on_threads,
     transform::Rigid,
-    verify::{
-        Calibration, Evidence, Sizes, conditioning, covariance, judge, meeting, overlap_at, scaled, seen,
-    },
+    verify::{Calibration, Evidence, Sizes, Uncertainty, judge, meeting, overlap_at, scaled, seen},
     watch::{Call, Stage, Stop, Watch},
 };
 
@@ -494,6 +493,7 @@ impl<'a> Pipeline<'a> {
         };
         let forward = meeting(source, &held_out(self.source), target, pose, limit);
         let backward = meeting(target, &held_out(self.target), source, &pose.inverse(), limit);
+        let uncertainty = self.uncertainty(pose);
         let tolerance = self.match_tolerance();
         let explained = |matches: &[Match]| matches.iter().filter(|m| m.agrees_with(pose, tolerance)).count();
         let evidence = Evidence {
@@ -503,14 +503,14 @@ impl<'a> Pipeline<'a> {
             glimpsed: best.glimpsed,
             agreement: best.agreement,
             matches: (!self.matches.is_empty()).then(|| [explained(&self.matches), self.matches.len()]),
-            conditioning: conditioning(&best.refined.shape_hessian, radius),
+            conditioning: uncertainty.conditioning,
+            free_directions: uncertainty.free.ncols(),
             converged: best.refined.converged || self.settings.refine == Refinement::None,
             samples: source.sparse && target.sparse,
             ..Evidence::none(source.points.len().min(target.points.len()))
         };
         let evidence = seen([&forward, &backward], limit, evidence);
         let verdict = judge(&evidence, &self.calibration);
-        let covariance = covariance(&best.refined.hessian, best.refined.variance, radius);
         Registration {
             T_target_source: self.file_pose(pose),
             fitness: forward.share(limit),
@@ -519,7 +519,8 @@ impl<'a> Pipeline<'a> {
             converged: evidence.converged && forward.count(limit) > 0,
             iterations: best.refined.iterations,
             probability: verdict.probability,
-            covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
+            covariance: rows(&uncertainty.covariance),
+            free_directions: free_direction::name(&uncertainty.free, radius, self.target.origin),
             reasons: verdict.reasons,
             alternatives: (others.iter().filter(|c| relative(c) >= RIVALLING).take(RIVALS))
                 .map(|c| Alternative {
@@ -564,6 +565,27 @@ impl<'a> Pipeline<'a> {
         }
     }
 
+    /// How far `pose` may be off, as the pairs of the last refinement tell.
+    fn uncertainty(&self, pose: &Rigid) -> Uncertainty {
+        let radius = f64::from(self.source.fine.radius);
+        let moved = Level::thin(&self.source.refined_points(), FINE_POINTS);
+        let icp = self.icp(&self.source.fine, &self.target.fine);
+        let reach = REACH_VOXELS * self.voxel_size as f32;
+        let mut schedule = Schedule::settled(reach, self.settings.overlap.unwrap_or(1.0));
+        if self.settings.refine == Refinement::None {
+            // What was never refined may lie further off.
+            schedule.max_slide_voxels = f32::INFINITY;
+        }
+        let tangent = match &self.lock {
+            Some(lock) => lock.tangent(pose),
+            None => Matrix6xX::identity(6),
+        };
+        match icp.information(&moved, pose, &schedule) {
+            Some(information) => Uncertainty::of(&information, &tangent, radius),
+            None => Uncertainty::unknown(radius),
+        }
+    }
+
     /// The answer where no source of hypotheses had any.
     fn nothing_found(&self) -> Registration {
         let points = self.source.fine.points.len().min(self.target.fine.points.len());
@@ -587,7 +609,6 @@ impl<'a> Pipeline<'a> {
 
 /// The answer where nothing is known but about how large the source is.
 fn nothing_known(radius: f64, settings: &Settings) -> Registration {
-    let covariance = covariance(&Matrix6::zeros(), 0.0, radius);
     Registration {
         T_target_source: settings.first_guess(),
         fitness: 0.0,
@@ -596,7 +617,8 @@ fn nothing_known(radius: f64, settings: &Settings) -> Registration {
         converged: false,
         iterations: 0,
         probability: 0.0,
-        covariance: std::array::from_fn(|r| std::array::from_fn(|c| covariance[(r, c)])),
+        covariance: rows(&Uncertainty::unknown(radius).covariance),
+        free_directions: Vec::new(),
         reasons: Vec::new(),
         alternatives: Vec::new(),
         source_scale: None,
@@ -607,6 +629,10 @@ fn nothing_known(radius: f64, settings: &Settings) -> Registration {
         settings: settings.clone(),
         timings_ms: Timings::default(),
     }
+}
+
+fn rows(m: &Matrix6<f64>) -> [[f64; 6]; 6] {
+    std::array::from_fn(|r| std::array::from_fn(|c| m[(r, c)]))
 }
 
 /// Matched points lie this many coarse voxels apart at most under a right pose.

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use crate::{
+    free_direction::FreeDirection,
     settings::{Method, Settings},
     transform::Rigid,
     verify::Evidence,
@@ -95,9 +96,15 @@ pub struct Registration {
     pub iterations: usize,
     /// Probability that the pose is right, 0 to 1.
     pub probability: f64,
-    /// Covariance of the left twist (rotation rad, translation) of the pose, about the centre of the target's
-    /// bounding box.
+    /// How far the pose may be off near the optimum found: the covariance, in rad² and squared units of the clouds, of
+    /// the left twist `(ωx, ωy, ωz, vx, vy, vz)` that takes the pose found to the right one.
+    ///
+    /// With c the centre of the target's bounding box, a point y of the registered source belongs at
+    /// `y + ω × (y − c) + v`, axes being those of the target's file. Locked degrees of freedom have no variance; free
+    /// ones that of an angle uniform over the circle, (π²/3) rad², or of a length of the source's radius.
     pub covariance: [[f64; 6]; 6],
+    /// Motions that the geometry does not hold: along a plane, about a cylinder.
+    pub free_directions: Vec<FreeDirection>,
     /// What speaks against the pose.
     pub reasons: Vec<Reason>,
     /// Other poses that explain the clouds nearly as well, best first: those of a square table turned by quarters.

@@ -1,7 +1,10 @@
-//! Whether the verdicts can be trusted: fitting the probability, and measuring what it is worth.
+//! Whether the verdicts can be trusted: fitting the probability, and measuring what it, the covariance and the free
+//! directions are worth.
 
 pub mod cases;
+pub mod covariance;
 mod fit;
+pub mod free_axes;
 mod observe;
 #[cfg(feature = "train")]
 mod plot;

@@ -1,24 +1,26 @@
 //! Iterative closest points, coarse to fine.
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use super::{
     Factor, LockedPose, RobustKernel,
     solver::{Correspondence, MIN_DAMPING, Objective},
 };
-use crate::{prepare::Level, refine::Refinement, transform::Rigid, watch::Call};
+use crate::{prepare::Level, transform::Rigid, watch::Call};
 
 /// Source points are matched in blocks of this many; the blocks' results stand in order.
 const BLOCK: usize = 256;
 /// Surfaces that face more than this far apart (cosine) are not the same surface.
 const NORMAL_COSINE: f32 = 0.5;
 /// Fewer pairs than a pose has degrees of freedom hold none.
-const FEWEST_PAIRS: usize = 6;
+pub(super) const FEWEST_PAIRS: usize = 6;
 /// No target point was near.
 const NOTHING: u32 = u32::MAX;
 /// Residuals that tell the kernel's scale.
 const SCALE_SAMPLE: usize = 1024;
+/// See [`Schedule::max_slide_voxels`].
+const MAX_SLIDE_VOXELS: f32 = 0.75;
 /// Motion in voxels, at the target's rim, under which the pose has settled.
 const SETTLED_VOXELS: f64 = 1e-2;
 
@@ -33,22 +35,32 @@ pub(crate) struct Schedule {
     pub max_iterations: usize,
     /// Share of the closest pairs that is kept.
     pub keep: f64,
+    /// Once the distance is at its last, pairs this many voxels apart along the surface are no pairs either: averages
+    /// of cells have a partner nearer than that, unless the other scan ends there.
+    pub max_slide_voxels: f32,
 }
 
 impl Schedule {
     /// A few steps at a coarse level, whose pairs are `reach` apart at most.
     pub fn coarse(reach: f32) -> Self {
-        Self { max_distance: (2.0 * reach, reach), shrink_over: 4, max_iterations: 6, keep: 1.0 }
+        Self {
+            max_distance: (2.0 * reach, reach),
+            shrink_over: 4,
+            max_iterations: 6,
+            keep: 1.0,
+            max_slide_voxels: f32::INFINITY,
+        }
     }
 
     /// Until the pose settles, from pairs `first` apart to pairs `reach` apart.
     pub fn fine(first: f32, reach: f32, keep: f64) -> Self {
-        Self { max_distance: (first, reach), shrink_over: 6, max_iterations: 30, keep }
+        let max_slide_voxels = MAX_SLIDE_VOXELS;
+        Self { max_distance: (first, reach), shrink_over: 6, max_iterations: 30, keep, max_slide_voxels }
     }
 
     /// A few last steps with pairs `reach` apart at most.
     pub fn settled(reach: f32, keep: f64) -> Self {
-        Self { max_distance: (reach, reach), shrink_over: 1, max_iterations: 4, keep }
+        Self { shrink_over: 1, max_iterations: 4, ..Self::fine(reach, reach, keep) }
     }
 }
 
@@ -58,12 +70,6 @@ pub(crate) struct Refined {
     pub pose: Rigid,
     pub iterations: usize,
     pub converged: bool,
-    /// Information about the pose (left twist about the target's local origin), per unit residual variance.
-    pub hessian: Matrix6<f64>,
-    /// Variance of a residual.
-    pub variance: f64,
-    /// As `hessian`, of distances along the surfaces' normals alone: what the shape itself holds.
-    pub shape_hessian: Matrix6<f64>,
 }
 
 /// Iterative closest points between two clouds.
@@ -79,14 +85,8 @@ pub(crate) struct Icp<'a> {
 impl<'a> Icp<'a> {
     /// Refines `pose` by moving the points `moved` of the source onto the target.
     pub fn refine(&self, moved: &[u32], pose: &Rigid, schedule: &Schedule) -> Refined {
-        let mut refined = Refined {
-            pose: self.lock.map_or(*pose, |l| l.project(pose)),
-            iterations: 0,
-            converged: false,
-            hessian: Matrix6::zeros(),
-            variance: 0.0,
-            shape_hessian: Matrix6::zeros(),
-        };
+        let mut refined =
+            Refined { pose: self.lock.map_or(*pose, |l| l.project(pose)), iterations: 0, converged: false };
         let (first, last) = schedule.max_distance;
         let mut damping = MIN_DAMPING;
         let mut nearest = vec![NOTHING; moved.len()];
@@ -96,7 +96,8 @@ impl<'a> Icp<'a> {
             }
             let along = (iteration as f32 / schedule.shrink_over.max(1) as f32).min(1.0);
             let max_distance = first * (last / first).powf(along);
-            let mut pairs = self.correspondences(moved, &refined.pose, max_distance, &mut nearest);
+            let max_slide = if along < 1.0 { f32::INFINITY } else { self.max_slide(schedule) };
+            let mut pairs = self.correspondences(moved, &refined.pose, max_distance, max_slide, &mut nearest);
             keep_closest(&mut pairs, &refined.pose, schedule.keep);
             if pairs.len() < FEWEST_PAIRS {
                 refined.converged = false;
@@ -119,24 +120,31 @@ impl<'a> Icp<'a> {
                 break;
             }
         }
-        let mut pairs = self.correspondences(moved, &refined.pose, last, &mut nearest);
-        keep_closest(&mut pairs, &refined.pose, schedule.keep);
-        if pairs.len() < FEWEST_PAIRS {
-            refined.converged = false;
-            return refined;
-        }
-        let objective = self.objective(&pairs, &refined.pose, last);
-        let model = objective.linearize(&refined.pose, &pairs);
-        refined.hessian = model.hessian;
-        let along_normals = Objective { factor: super::factor(Refinement::Plane, false), ..objective };
-        refined.shape_hessian = along_normals.linearize(&refined.pose, &pairs).hessian;
-        refined.variance = model.residual_sq / model.weight.max(f64::MIN_POSITIVE);
         refined
+    }
+
+    /// The pairs of the points `moved` at `pose` as the last iteration of `schedule` makes them.
+    pub(super) fn last_pairs(&self, moved: &[u32], pose: &Rigid, schedule: &Schedule) -> Vec<Correspondence> {
+        let mut nearest = vec![NOTHING; moved.len()];
+        let (_, reach) = schedule.max_distance;
+        let mut pairs = self.correspondences(moved, pose, reach, self.max_slide(schedule), &mut nearest);
+        keep_closest(&mut pairs, pose, schedule.keep);
+        pairs
+    }
+
+    /// How far apart along the surface pairs may be in the end; samples as they were taken may lie anywhere.
+    fn max_slide(&self, schedule: &Schedule) -> f32 {
+        if self.target.gridded { schedule.max_slide_voxels * self.target.voxel_size } else { f32::INFINITY }
     }
 
     /// What is minimised over `pairs`. The kernel's scale comes from the residuals themselves: a few robust
     /// standard deviations, within what the search radius allows.
-    fn objective(&self, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> Objective<'a> {
+    pub(super) fn objective(
+        &self,
+        pairs: &[Correspondence],
+        pose: &Rigid,
+        max_distance: f32,
+    ) -> Objective<'a> {
         let plain = Objective { factor: self.factor, kernel: RobustKernel::None, scale_sq: 1.0 };
         let mut squares: Vec<f64> = pairs
             .iter()
@@ -159,6 +167,7 @@ impl<'a> Icp<'a> {
         moved: &[u32],
         pose: &Rigid,
         max_distance: f32,
+        max_slide: f32,
         nearest: &mut [u32],
     ) -> Vec<Correspondence> {
         let (source, target) = (self.source, self.target);
@@ -180,14 +189,19 @@ impl<'a> Icp<'a> {
                     *nearest = neighbor.map_or(NOTHING, |n| n.index);
                     let Some(neighbor) = neighbor else { continue };
                     let (m, n) = (source.normals[i as usize], target.normals[neighbor.index as usize]);
-                    if (rotation * Vector3::from(m)).dot(&Vector3::from(n)).abs() < NORMAL_COSINE {
+                    let (q, n) = (Vector3::from(target.points[neighbor.index as usize]), Vector3::from(n));
+                    if (rotation * Vector3::from(m)).dot(&n).abs() < NORMAL_COSINE {
+                        continue;
+                    }
+                    let across = n.dot(&(y - q));
+                    if (y - q).norm_squared() - across * across > max_slide * max_slide {
                         continue;
                     }
                     found.push(Correspondence {
                         source: p,
-                        target: target.points[neighbor.index as usize],
+                        target: q.into(),
                         source_normal: m,
-                        target_normal: n,
+                        target_normal: n.into(),
                     });
                 }
                 found

@@ -3,7 +3,7 @@
 //! The pose in the files' frames is written as `R = Rz(yaw) Ry(pitch) Rx(roll)` and `t`; the solver steps in
 //! the free ones of these six numbers, so the locked ones keep their value to the last bit.
 
-use nalgebra::{DMatrix, Matrix3, Rotation3, Vector3};
+use nalgebra::{Matrix3, Matrix6xX, Rotation3, Vector3};
 
 use serde::Serialize;
 
@@ -90,7 +90,7 @@ impl LockedPose {
     }
 
     /// Columns: how each free parameter moves the local pose, as a left twist (rotation, translation).
-    pub fn tangent(&self, local: &Rigid) -> DMatrix<f64> {
+    pub fn tangent(&self, local: &Rigid) -> Matrix6xX<f64> {
         let file = self.to_file(local);
         let [_, pitch, yaw, ..] = parameters(&file);
         let (sp, cp, sy, cy) = (pitch.sin(), pitch.cos(), yaw.sin(), yaw.cos());
@@ -100,7 +100,7 @@ impl LockedPose {
         // ω × y_local + (ṫ + ω × (o_target − t_file)).
         let arm = self.target_origin - file.translation;
         let free: Vec<usize> = (0..6).filter(|&k| !self.locks.flags()[k]).collect();
-        let mut tangent = DMatrix::zeros(6, free.len());
+        let mut tangent = Matrix6xX::zeros(free.len());
         for (column, &k) in free.iter().enumerate() {
             if k < 3 {
                 let omega: Vector3<f64> = rates.column(k).into();

@@ -5,6 +5,7 @@
 
 mod gicp;
 mod icp;
+mod information;
 mod lock;
 mod plane;
 mod point;
@@ -12,6 +13,7 @@ mod robust;
 mod solver;
 
 pub(crate) use icp::{Icp, Refined, Schedule};
+pub(crate) use information::{Information, Patch};
 pub(crate) use lock::LockedPose;
 pub use lock::Locks;
 pub use robust::RobustKernel;

@@ -42,6 +42,18 @@ impl RobustKernel {
             Self::Tukey => (0.0, scale_sq / 3.0),
         }
     }
+
+    /// Derivative of the weight by `residual_sq / scale_sq`.
+    pub(super) fn weight_slope(self, residual_sq: f64, scale_sq: f64) -> f64 {
+        let x = residual_sq / scale_sq;
+        match self {
+            Self::Huber if x > 1.0 => -0.5 * x.powf(-1.5),
+            Self::Cauchy => -1.0 / (1.0 + x).powi(2),
+            Self::GemanMcclure => -2.0 / (1.0 + x).powi(3),
+            Self::Tukey if x < 1.0 => -2.0 * (1.0 - x),
+            Self::None | Self::Huber | Self::Tukey => 0.0,
+        }
+    }
 }
 
 #[cfg(test)]
@@ -65,6 +77,19 @@ mod tests {
                 let slope = (cost(residual_sq + h) - cost(residual_sq - h)) / (2.0 * h);
                 let (weight, _) = kernel.weight_and_cost(residual_sq, scale_sq);
                 assert!((slope - weight).abs() < 1e-6, "{kernel:?} at {residual_sq}: {slope} {weight}");
+            }
+        }
+    }
+
+    #[test]
+    fn slope_is_the_derivative_of_the_weight() {
+        for kernel in ALL {
+            for residual_sq in [0.01, 0.5, 1.9, 2.1, 3.0, 40.0] {
+                let (scale_sq, h) = (2.0, 1e-6);
+                let weight = |r| kernel.weight_and_cost(r, scale_sq).0;
+                let slope = scale_sq * (weight(residual_sq + h) - weight(residual_sq - h)) / (2.0 * h);
+                let found = kernel.weight_slope(residual_sq, scale_sq);
+                assert!((slope - found).abs() < 1e-6, "{kernel:?} at {residual_sq}: {slope} {found}");
             }
         }
     }

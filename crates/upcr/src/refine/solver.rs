@@ -26,29 +26,17 @@ pub(crate) struct Linearized {
     pub hessian: Matrix6<f64>,
     pub gradient: Vector6<f64>,
     pub cost: f64,
-    /// Sum of robust weights.
-    pub weight: f64,
-    /// Weighted sum of squared residuals.
-    pub residual_sq: f64,
 }
 
 impl Linearized {
     fn zero() -> Self {
-        Self {
-            hessian: Matrix6::zeros(),
-            gradient: Vector6::zeros(),
-            cost: 0.0,
-            weight: 0.0,
-            residual_sq: 0.0,
-        }
+        Self { hessian: Matrix6::zeros(), gradient: Vector6::zeros(), cost: 0.0 }
     }
 
     fn plus(mut self, other: &Self) -> Self {
         self.hessian += other.hessian;
         self.gradient += other.gradient;
         self.cost += other.cost;
-        self.weight += other.weight;
-        self.residual_sq += other.residual_sq;
         self
     }
 }
@@ -70,6 +58,15 @@ struct Residual {
     squared: f64,
 }
 
+/// Force on the moved point of a pair, the gradient of half its cost.
+pub(crate) struct Pull {
+    pub force: Vector3<f64>,
+    /// Its derivative by the point, weights held.
+    pub hessian: Matrix3<f64>,
+    /// Its derivative by the point, the kernel's weight changing with it.
+    pub derivative: Matrix3<f64>,
+}
+
 impl Objective<'_> {
     fn residual(&self, pose: &Rigid, c: &Correspondence) -> Residual {
         let y = pose.rotation * Vector3::from(c.source.map(f64::from)) + pose.translation;
@@ -84,6 +81,20 @@ impl Objective<'_> {
     /// Squared residual under the factor's information.
     pub fn squared(&self, pose: &Rigid, c: &Correspondence) -> f64 {
         self.residual(pose, c).squared
+    }
+
+    /// What one pair does to its point under the pose.
+    pub fn pull(&self, pose: &Rigid, c: &Correspondence) -> Pull {
+        let Residual { r, information, squared, .. } = self.residual(pose, c);
+        let (weight, _) = self.kernel.weight_and_cost(squared, self.scale_sq);
+        let (information, straight) = (full(&information), times(&information, &r));
+        let hessian = information * weight;
+        let bend = 2.0 * self.kernel.weight_slope(squared, self.scale_sq) / self.scale_sq;
+        Pull {
+            force: straight * weight,
+            hessian,
+            derivative: hessian + straight * straight.transpose() * bend,
+        }
     }
 
     /// Σ ρ.
@@ -115,8 +126,7 @@ impl Objective<'_> {
     fn add(&self, pose: &Rigid, c: &Correspondence, sum: &mut Linearized) {
         let Residual { y, r, information, squared } = self.residual(pose, c);
         let (w, cost) = self.kernel.weight_and_cost(squared, self.scale_sq);
-        let m = information.map(|v| v * w);
-        let full = Matrix3::new(m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5]);
+        let full = full(&information) * w;
         // dy = ω × y + v, so the Jacobian is [−[y]ₓ, I].
         let hat = y.cross_matrix();
         let hat_m = hat * full;
@@ -135,8 +145,6 @@ impl Objective<'_> {
             }
         }
         sum.cost += cost;
-        sum.weight += w;
-        sum.residual_sq += w * squared;
     }
 
     /// One Levenberg–Marquardt step: the new pose and the twist or parameter step taken, or `None` where no
@@ -196,6 +204,10 @@ fn solve_dynamic(mut hessian: DMatrix<f64>, gradient: &DVector<f64>, damping: f6
     }
     let step = hessian.cholesky()?.solve(&-gradient);
     step.iter().all(|v| v.is_finite()).then_some(step)
+}
+
+fn full(m: &Symmetric3) -> Matrix3<f64> {
+    Matrix3::new(m[0], m[1], m[2], m[1], m[3], m[4], m[2], m[4], m[5])
 }
 
 fn times(m: &Symmetric3, v: &Vector3<f64>) -> Vector3<f64> {

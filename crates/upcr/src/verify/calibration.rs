@@ -13,7 +13,7 @@ use crate::{Error, Result};
 const EMBEDDED: &str = include_str!("calibration.json");
 
 /// What [`Evidence`] becomes before it is weighed, one number each.
-pub const FEATURES: [&str; 17] = [
+pub const FEATURES: [&str; 18] = [
     "smaller_overlap",
     "larger_overlap",
     "closeness",
@@ -31,6 +31,7 @@ pub const FEATURES: [&str; 17] = [
     "ln_inliers",
     "ln_points",
     "ln_conditioning",
+    "has_free_direction",
 ];
 
 impl Evidence {
@@ -58,6 +59,7 @@ impl Evidence {
             (self.inliers as f64).ln_1p(),
             (self.points.max(1) as f64).ln(),
             self.conditioning.max(1e-6).ln(),
+            f64::from(self.free_directions > 0),
         ]
     }
 }

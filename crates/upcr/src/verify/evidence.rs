@@ -40,8 +40,10 @@ pub struct Evidence {
     pub agreement: f64,
     /// How many feature matches the pose explains, and of how many; `None` where none were looked for.
     pub matches: Option<[usize; 2]>,
-    /// Ratio of the worst to the best held direction.
+    /// Information about the motion that the surfaces hold least, over that about the one that they hold best.
     pub conditioning: f64,
+    /// How many directions of motion nothing holds.
+    pub free_directions: usize,
     /// Whether the refinement settled.
     pub converged: bool,
     /// Points of the smaller cloud.
@@ -66,6 +68,7 @@ impl Evidence {
             agreement: 0.0,
             matches: None,
             conditioning: 0.0,
+            free_directions: 0,
             converged: true,
             points,
             samples: true,

@@ -8,7 +8,7 @@ mod scale;
 mod verdict;
 
 pub use calibration::{Calibration, FEATURES, Weights};
-pub(crate) use conditioning::{conditioning, covariance};
+pub(crate) use conditioning::Uncertainty;
 pub use evidence::Evidence;
 pub(crate) use evidence::{meeting, seen};
 pub(crate) use overlap::overlap_at;

@@ -10,12 +10,6 @@ const FEWEST_POINTS: usize = 50;
 /// Overlap under which a pose is called a pose of clouds that share nothing, and that share little.
 const NO_OVERLAP: f64 = 0.1;
 const LOW_OVERLAP: f64 = 0.3;
-/// Information, relative to the best held direction, under which a direction is free. Real scans of rooms,
-/// streets and statues have 0.005 and more; planes and cylinders under scanner noise less than 0.001.
-const FREE_DIRECTION: f64 = 0.0015;
-/// Residuals this small show that points were sampled once and then moved: then
-/// the samples hold the pose where the shape does not.
-const SAME_SAMPLES: f64 = 0.9;
 /// A caveat that speaks against the pose itself leaves at most this.
 const DOUBTFUL: f64 = 0.45;
 
@@ -43,7 +37,7 @@ pub(crate) fn judge(e: &Evidence, calibration: &Calibration) -> Verdict {
         if e.rivals > 0 {
             reasons.push(Reason::Ambiguous);
         }
-        if e.conditioning < FREE_DIRECTION && e.closeness < SAME_SAMPLES {
+        if e.free_directions > 0 {
             reasons.push(Reason::DegenerateAxis);
         }
     }
@@ -82,6 +76,7 @@ mod tests {
         agreement: 0.5,
         matches: Some([200, 800]),
         conditioning: 0.02,
+        free_directions: 0,
         converged: true,
         points: 5000,
         samples: false,
@@ -104,7 +99,7 @@ mod tests {
             (Evidence { inliers: 5, ..GOOD }, Reason::TooFewPoints),
             (Evidence { overlap: [0.2, 0.2], ..GOOD }, Reason::LowOverlap),
             (Evidence { rivals: 1, ..GOOD }, Reason::Ambiguous),
-            (Evidence { conditioning: 1e-5, ..GOOD }, Reason::DegenerateAxis),
+            (Evidence { free_directions: 1, ..GOOD }, Reason::DegenerateAxis),
             (Evidence { points: 20, ..GOOD }, Reason::TooFewPoints),
             (Evidence { closeness: 0.3, ..GOOD }, Reason::PoorFit),
         ];
