@@ -11,7 +11,9 @@ use upcr_lab::data::Split;
 use upcr_lab::drawing;
 use upcr_lab::files::write_atomically;
 use upcr_lab::trust::cases::Material;
-use upcr_lab::trust::{Observed, Reliability, Trust, asked_in_all_ways, fit, markdown, observe, picture};
+use upcr_lab::trust::{
+    Observed, Reliability, Trust, asked_in_all_ways, covariance, fit, free_axes, markdown, observe, picture,
+};
 
 use crate::output::{self, Progress};
 
@@ -71,6 +73,12 @@ struct Test {
     /// Pairs of clouds that have nothing in common, made of each data set
     #[arg(long, value_name = "N", default_value_t = 1000)]
     strangers: u64,
+    /// Noisy pairs over which the covariance is measured; they are made of the first data set of shapes
+    #[arg(long, value_name = "N", default_value_t = 1000)]
+    covariance: usize,
+    /// Scans of a plane, a cylinder, a corridor and a sphere each, whose free directions are to be named
+    #[arg(long, value_name = "N", default_value_t = 100)]
+    free_axes: usize,
     /// The calibration to be measured [default: the one in the program]
     #[arg(long, value_name = "FILE")]
     calibration: Option<PathBuf>,
@@ -164,6 +172,7 @@ fn run_test(args: &Test) -> Result<ExitCode> {
     let settings = Settings { calibration, ..Settings::default() };
     let as_told = |_, _: &_| settings.clone();
     let (mut reliability, mut strangers, mut all) = (Vec::new(), Vec::new(), Vec::new());
+    let mut covered = Vec::new();
     for path in &args.data {
         let (name, material) = (name(path), Material::open(path, Split::Test)?);
         let case = |index| material.case(args.seed, index);
@@ -173,13 +182,27 @@ fn run_test(args: &Test) -> Result<ExitCode> {
         if args.strangers > 0 {
             let case = |index| material.strangers(args.seed, index);
             let told = teller(format!("{name}, nothing in common"), args.strangers);
-            strangers.push((name, Reliability::of(&observe(args.strangers, case, as_told, &told)?).counts));
+            strangers.push((name.clone(), Reliability::of(&observe(args.strangers, case, as_told, &told)?).counts));
         }
+        if let Material::Shapes(shapes) = &material
+            && covered.is_empty()
+            && args.covariance > 0
+        {
+            let mut progress = Progress::new();
+            progress.step(&format!("{name}, covariance"));
+            covered = covariance::measure(shapes, args.covariance, args.seed, &settings)?;
+        }
+    }
+    let mut free = Vec::new();
+    if args.free_axes > 0 {
+        let mut progress = Progress::new();
+        progress.step("free directions");
+        free = free_axes::measure(args.free_axes, args.seed, &settings)?;
     }
     if reliability.len() > 1 {
         reliability.push(("all".into(), Reliability::of(&all)));
     }
-    let trust = Trust { reliability, strangers };
+    let trust = Trust { reliability, strangers, covariance: covered, free_axes: free };
     let text = markdown(&trust);
     let panels: Vec<_> = trust.reliability.iter().map(|(name, found)| (name.as_str(), found)).collect();
     let picture = picture(&panels);
@@ -187,6 +210,8 @@ fn run_test(args: &Test) -> Result<ExitCode> {
         "trust": trust,
         "pairs": args.pairs,
         "strangers": args.strangers,
+        "covariance": args.covariance,
+        "free_axes": args.free_axes,
         "seed": args.seed,
         "version": env!("CARGO_PKG_VERSION"),
     });

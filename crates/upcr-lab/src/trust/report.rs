@@ -5,6 +5,8 @@ use std::fmt::Write;
 use serde::Serialize;
 use upcr::TRUSTWORTHY;
 
+use super::covariance::Coverage;
+use super::free_axes::Named;
 use super::reliability::{Counts, Reliability, SURE};
 
 /// All that was measured of the verdicts.
@@ -14,6 +16,16 @@ pub struct Trust {
     pub reliability: Vec<(String, Reliability)>,
     /// Over clouds that have nothing to do with each other, by set.
     pub strangers: Vec<(String, Counts)>,
+    /// Of the covariance, over all noisy pairs and by kind; empty where it was not measured.
+    pub covariance: Vec<Coverage>,
+    /// Of the free directions, by shape; empty where it was not measured.
+    pub free_axes: Vec<Named>,
+}
+
+/// A choice as it is written in a table.
+fn word(choice: &impl Serialize) -> String {
+    let value = serde_json::to_value(choice).ok();
+    value.as_ref().and_then(|value| value.as_str()).unwrap_or("all").replace('_', " ")
 }
 
 /// The tables, in Markdown.
@@ -41,8 +53,7 @@ pub fn markdown(trust: &Trust) -> String {
     );
     for (name, found) in &trust.reliability {
         for (kind, counts) in &found.by_kind {
-            let kind = serde_json::to_value(kind).ok();
-            let kind = kind.as_ref().and_then(|kind| kind.as_str()).unwrap_or_default().replace('_', " ");
+            let kind = word(kind);
             let Counts { pairs, right, right_refused, wrong_trusted, wrong_sure } = counts;
             let _ = writeln!(
                 text,
@@ -62,6 +73,26 @@ pub fn markdown(trust: &Trust) -> String {
                 "| {name} | {} | {} | {} |",
                 counts.pairs, counts.wrong_trusted, counts.wrong_sure
             );
+        }
+    }
+    if !trust.covariance.is_empty() {
+        text.push_str(
+            "\n## Covariance\n\n| pairs | number | right | true pose in the 95 % ellipsoid | share | mean NEES (6 is ideal) |\n\
+             |---|---:|---:|---:|---:|---:|\n",
+        );
+        for Coverage { kind, pairs, right, covered, share, mean_nees } in &trust.covariance {
+            let share = 100.0 * share;
+            let _ = writeln!(
+                text,
+                "| {} | {pairs} | {right} | {covered} | {share:.1} % | {mean_nees:.2} |",
+                word(kind)
+            );
+        }
+    }
+    if !trust.free_axes.is_empty() {
+        text.push_str("\n## Free directions\n\n| shape | pairs | named, and nothing else |\n|---|---:|---:|\n");
+        for Named { shape, pairs, named } in &trust.free_axes {
+            let _ = writeln!(text, "| {} | {pairs} | {named} |", word(shape));
         }
     }
     text
