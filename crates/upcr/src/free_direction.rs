@@ -79,7 +79,11 @@ pub(crate) fn name(free: &Matrix6xX<f64>, radius: f64, origin: [f64; 3]) -> Vec<
         shifts.fixed_rows_mut::<3>(3 * k).copy_from(&(shift - explained));
     }
     // The least of all solutions: axes that do not meet in one point leave it free along them.
-    let solved = if turns.is_empty() { Err("no axis") } else { crosses.svd(true, true).solve(&shifts, SHARP / radius) };
+    let solved = if turns.is_empty() {
+        Err("no axis")
+    } else {
+        crosses.svd(true, true).solve(&shifts, SHARP / radius)
+    };
     let point = solved.map_or(V::from(origin), |c| V::new(c[0], c[1], c[2]) + V::from(origin)).into();
 
     let slides = slides.iter().map(|axis| FreeDirection::Translation { axis: upward(axis) });

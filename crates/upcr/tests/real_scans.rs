@@ -18,7 +18,8 @@ fn assert_registers(pairs: impl Iterator<Item = Pair>, degrees: f64, centroid: f
         let error = pair.error(&found.T_target_source);
         let free = &found.free_directions;
         if !error.within(degrees, centroid) || !found.is_trustworthy() || !free.is_empty() {
-            wrong.push(format!("{}: {error}, probability {:.3}, free {free:?}", pair.name, found.probability));
+            wrong
+                .push(format!("{}: {error}, probability {:.3}, free {free:?}", pair.name, found.probability));
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));

@@ -56,11 +56,7 @@ fn named(shape: Shape, pairs: usize, seed: u64, settings: &Settings) -> Result<N
         let specimen = Specimen::new(shape, rng);
         let [(source, _), (target, T_target_shape)] = [specimen.scan(rng), specimen.scan(rng)];
         let found = register(&source, &target, settings)?;
-        let right = shape.is_named_by(&found.free_directions, &T_target_shape, specimen.size);
-        if !right && std::env::var_os("DEBUG_FREE").is_some() {
-            eprintln!("{shape:?} {index} {specimen:?} {:?} {:?} p {} T {T_target_shape:?}", found.free_directions, found.reasons, found.probability);
-        }
-        Ok(right)
+        Ok(shape.is_named_by(&found.free_directions, &T_target_shape, specimen.size))
     };
     let named = (0..pairs).into_par_iter().map(is_named).collect::<Result<Vec<_>>>()?;
     Ok(Named { shape, pairs, named: named.iter().filter(|right| **right).count() })
@@ -82,17 +78,24 @@ impl Shape {
         let origin = T_target_shape.translation;
         let close = TOLERANCE_DEG.to_radians().sin();
         let right = |direction: &FreeDirection| match (self, direction) {
-            (Self::Plane, FreeDirection::Translation { axis: slide }) => V::from(*slide).dot(&axis).abs() < close,
+            (Self::Plane, FreeDirection::Translation { axis: slide }) => {
+                V::from(*slide).dot(&axis).abs() < close
+            }
             (Self::Cylinder | Self::Corridor, FreeDirection::Translation { axis: slide }) => {
                 V::from(*slide).cross(&axis).norm() < close
             }
-            (Self::Plane, FreeDirection::Rotation { axis: turn, .. }) => V::from(*turn).cross(&axis).norm() < close,
+            (Self::Plane, FreeDirection::Rotation { axis: turn, .. }) => {
+                V::from(*turn).cross(&axis).norm() < close
+            }
             (Self::Cylinder, FreeDirection::Rotation { axis: turn, point }) => {
                 let off = (V::from(*point) - origin).cross(&axis).norm();
                 V::from(*turn).cross(&axis).norm() < close && off < TOLERANCE * size
             }
-            (Self::Sphere, FreeDirection::Rotation { point, .. }) => (V::from(*point) - origin).norm() < TOLERANCE * size,
-            (Self::Corridor, FreeDirection::Rotation { .. }) | (Self::Sphere, FreeDirection::Translation { .. }) => false,
+            (Self::Sphere, FreeDirection::Rotation { point, .. }) => {
+                (V::from(*point) - origin).norm() < TOLERANCE * size
+            }
+            (Self::Corridor, FreeDirection::Rotation { .. })
+            | (Self::Sphere, FreeDirection::Translation { .. }) => false,
         };
         let slides = found.iter().filter(|d| matches!(d, FreeDirection::Translation { .. })).count();
         (slides, found.len() - slides) == self.freedom() && found.iter().all(right)
@@ -138,7 +141,8 @@ impl Specimen {
         // Where along the shape, and from which side, the scan looks.
         let (shift, side) = (rng.random_range(-0.15..0.15) * self.length, rng.random_range(0.0..TAU));
         let noise = |rng: &mut _| V::from_fn(|_, _| self.noise * random::normal(rng));
-        let point = |rng: &mut _| pose.apply(((self.point(shift, side, rng) + noise(rng)) * self.size).into());
+        let point =
+            |rng: &mut _| pose.apply(((self.point(shift, side, rng) + noise(rng)) * self.size).into());
         (PointCloud::from_points((0..self.points).map(|_| point(rng)).collect()), pose)
     }
 

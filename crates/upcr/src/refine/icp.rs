@@ -84,11 +84,8 @@ pub(crate) struct Icp<'a> {
 impl<'a> Icp<'a> {
     /// Refines `pose` by moving the points `moved` of the source onto the target.
     pub fn refine(&self, moved: &[u32], pose: &Rigid, schedule: &Schedule) -> Refined {
-        let mut refined = Refined {
-            pose: self.lock.map_or(*pose, |l| l.project(pose)),
-            iterations: 0,
-            converged: false,
-        };
+        let mut refined =
+            Refined { pose: self.lock.map_or(*pose, |l| l.project(pose)), iterations: 0, converged: false };
         let (first, last) = schedule.max_distance;
         let mut damping = MIN_DAMPING;
         let mut nearest = vec![NOTHING; moved.len()];
@@ -96,8 +93,7 @@ impl<'a> Icp<'a> {
             let along = (iteration as f32 / schedule.shrink_over.max(1) as f32).min(1.0);
             let max_distance = first * (last / first).powf(along);
             let max_slide = if along < 1.0 { f32::INFINITY } else { self.max_slide(schedule) };
-            let mut pairs =
-                self.correspondences(moved, &refined.pose, max_distance, max_slide, &mut nearest);
+            let mut pairs = self.correspondences(moved, &refined.pose, max_distance, max_slide, &mut nearest);
             keep_closest(&mut pairs, &refined.pose, schedule.keep);
             if pairs.len() < FEWEST_PAIRS {
                 refined.converged = false;
@@ -139,7 +135,12 @@ impl<'a> Icp<'a> {
 
     /// What is minimised over `pairs`. The kernel's scale comes from the residuals themselves: a few robust
     /// standard deviations, within what the search radius allows.
-    pub(super) fn objective(&self, pairs: &[Correspondence], pose: &Rigid, max_distance: f32) -> Objective<'a> {
+    pub(super) fn objective(
+        &self,
+        pairs: &[Correspondence],
+        pose: &Rigid,
+        max_distance: f32,
+    ) -> Objective<'a> {
         let plain = Objective { factor: self.factor, kernel: RobustKernel::None, scale_sq: 1.0 };
         let mut squares: Vec<f64> = pairs
             .iter()

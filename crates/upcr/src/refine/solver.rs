@@ -89,7 +89,11 @@ impl Objective<'_> {
         let (information, straight) = (full(&information), times(&information, &r));
         let hessian = information * weight;
         let bend = 2.0 * self.kernel.weight_slope(squared, self.scale_sq) / self.scale_sq;
-        Pull { force: straight * weight, hessian, derivative: hessian + straight * straight.transpose() * bend }
+        Pull {
+            force: straight * weight,
+            hessian,
+            derivative: hessian + straight * straight.transpose() * bend,
+        }
     }
 
     /// Σ ρ.

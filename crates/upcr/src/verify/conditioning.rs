@@ -169,7 +169,8 @@ mod tests {
                 (0..200).map(|_| Vector6::from_fn(|k, _| normal(&mut rng) / (1.0 + k as f64))).collect();
             let noise: Vec<f64> = rows.iter().map(|_| sigma * normal(&mut rng)).collect();
             let hessian: Matrix6<f64> = rows.iter().map(|a| a * a.transpose()).sum();
-            let error = hessian.cholesky().unwrap().solve(&rows.iter().zip(&noise).map(|(a, e)| a * *e).sum());
+            let error =
+                hessian.cholesky().unwrap().solve(&rows.iter().zip(&noise).map(|(a, e)| a * *e).sum());
             let pulls: Vec<f64> = rows.iter().zip(&noise).map(|(a, e)| a.dot(&error) - e).collect();
             let found = Uncertainty::of(&information(&rows, &pulls, 0.0), &all(), RADIUS);
             assert_eq!(found.free.ncols(), 0);
