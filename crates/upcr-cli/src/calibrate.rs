@@ -182,7 +182,10 @@ fn run_test(args: &Test) -> Result<ExitCode> {
         if args.strangers > 0 {
             let case = |index| material.strangers(args.seed, index);
             let told = teller(format!("{name}, nothing in common"), args.strangers);
-            strangers.push((name.clone(), Reliability::of(&observe(args.strangers, case, as_told, &told)?).counts));
+            strangers.push((
+                name.clone(),
+                Reliability::of(&observe(args.strangers, case, as_told, &told)?).counts,
+            ));
         }
         if let Material::Shapes(shapes) = &material
             && covered.is_empty()

@@ -1,7 +1,8 @@
 //! Measures whether registrations say the truth about themselves.
 //!
-//! `trust covariance SHAPES [PAIRS] [train|test] [gicp|plane|point|none]`, `trust free-axes [PAIRS]`
-//! `trust pair SOURCE TARGET [POSE_SOURCE POSE_TARGET]`
+//! `trust covariance SHAPES [PAIRS] [train|test] [gicp|plane|point|none]` or `trust free-axes [PAIRS]`
+
+#![allow(clippy::print_stdout)]
 
 use upcr::{Refinement, Settings};
 use upcr_lab::data::{self, Split};

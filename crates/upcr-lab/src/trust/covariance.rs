@@ -70,21 +70,10 @@ pub struct Coverage {
 /// Where shapes have too few points, or as [`register`] says.
 pub fn measure(shapes: &Shapes, pairs: usize, seed: u64, settings: &Settings) -> Result<Vec<Coverage>> {
     let outcome = |index: usize| -> Result<(Kind, Option<f64>)> {
-        let kind =
-            if std::env::var_os("OBJECT").is_some() { Kind::Object } else { TURNS[index % TURNS.len()] };
+        let kind = TURNS[index % TURNS.len()];
         let pair = pair(kind, shapes, &mut random::stream(seed, index as u64))?;
         let found = register(&pair.source, &pair.target, settings)?;
-        let nees = nees_where_right(&pair, &found)?;
-        if std::env::var_os("DEBUG_COV").is_some() {
-            eprintln!(
-                "{index} {kind:?} nees {nees:.2?} free {} iterations {} {:?} p {:.2}",
-                found.free_directions.len(),
-                found.iterations,
-                found.method,
-                found.probability
-            );
-        }
-        Ok((kind, nees))
+        Ok((kind, nees_where_right(&pair, &found)?))
     };
     let outcomes = (0..pairs).into_par_iter().map(outcome).collect::<Result<Vec<_>>>()?;
     let kinds =
@@ -121,27 +110,6 @@ pub fn nees(target: &PointCloud, truth: &Rigid, found: &Registration) -> Result<
         Rigid::from_translation(target.checked_bounds(CloudRole::Target)?.ok_or(no_extent)?.center());
     let error: Vector6<f64> = (center.inverse() * *truth * found.T_target_source.inverse() * center).log();
     let covariance = Matrix6::from_fn(|r, c| found.covariance[r][c]);
-    if std::env::var_os("DEBUG_COV").is_some() {
-        let r = found.voxel_size * 15.0;
-        let s = Matrix6::from_diagonal(&Vector6::new(r, r, r, 1.0, 1.0, 1.0)) / found.voxel_size;
-        let e = (s * covariance * s).symmetric_eigen();
-        let z = e.eigenvectors.transpose() * s * error;
-        let mut all: Vec<(f64, f64, f64)> = (0..6)
-            .map(|k| {
-                (
-                    e.eigenvalues[k].sqrt(),
-                    z[k] / e.eigenvalues[k].sqrt(),
-                    e.eigenvectors.column(k).rows(0, 3).norm(),
-                )
-            })
-            .collect();
-        all.sort_by(|a, b| a.0.total_cmp(&b.0));
-        eprint!("Z ");
-        for (std, z, _) in all {
-            eprint!("{std:.4}:{z:.2} ");
-        }
-        eprintln!();
-    }
     Ok(covariance.cholesky().map_or(f64::INFINITY, |c| error.dot(&c.solve(&error))))
 }
 
@@ -169,19 +137,6 @@ fn pair(kind: Kind, shapes: &Shapes, rng: &mut impl Rng) -> Result<Pair> {
     settings.sensor = coarser(settings.sensor);
     settings.overlap = rng.random_range(0.5..0.9);
     settings.turned = true;
-    let env = |name: &str| std::env::var(name).ok().and_then(|v| v.parse::<f64>().ok());
-    if let Some(f) = env("NOISE") {
-        settings.sensor.noise.constant_m *= f;
-        settings.sensor.noise.quadratic_per_m *= f;
-    }
-    if let Some(o) = env("OVERLAP") {
-        settings.overlap = o;
-    }
-    if env("GRAZE").is_some() {
-        settings.sensor.noise.grazing_deg = 90.0;
-        settings.sensor.noise.dropout = 0.0;
-    }
-
     settings.seed = rng.random();
     let scans = synth(&settings)?;
     let [source, target] = [&scans[0], &scans[1]];

@@ -56,14 +56,7 @@ fn named(shape: Shape, pairs: usize, seed: u64, settings: &Settings) -> Result<N
         let specimen = Specimen::new(shape, rng);
         let [(source, _), (target, T_target_shape)] = [specimen.scan(rng), specimen.scan(rng)];
         let found = register(&source, &target, settings)?;
-        let right = shape.is_named_by(&found.free_directions, &T_target_shape, specimen.size);
-        if !right && std::env::var_os("DEBUG_FREE").is_some() {
-            eprintln!(
-                "{shape:?} {index} {specimen:?} {:?} {:?} p {} T {T_target_shape:?}",
-                found.free_directions, found.reasons, found.probability
-            );
-        }
-        Ok(right)
+        Ok(shape.is_named_by(&found.free_directions, &T_target_shape, specimen.size))
     };
     let named = (0..pairs).into_par_iter().map(is_named).collect::<Result<Vec<_>>>()?;
     Ok(Named { shape, pairs, named: named.iter().filter(|right| **right).count() })

@@ -90,7 +90,9 @@ pub fn markdown(trust: &Trust) -> String {
         }
     }
     if !trust.free_axes.is_empty() {
-        text.push_str("\n## Free directions\n\n| shape | pairs | named, and nothing else |\n|---|---:|---:|\n");
+        text.push_str(
+            "\n## Free directions\n\n| shape | pairs | named, and nothing else |\n|---|---:|---:|\n",
+        );
         for Named { shape, pairs, named } in &trust.free_axes {
             let _ = writeln!(text, "| {} | {pairs} | {named} |", word(shape));
         }

@@ -45,6 +45,9 @@ impl Uncertainty {
         let basis = (Matrix6::from_diagonal(&rim) * tangent).qr().q();
         let twists = scale * &basis;
         let unknowns = basis.ncols();
+        if unknowns == 0 {
+            return Self { covariance: Matrix6::zeros(), free: Matrix6xX::zeros(0) };
+        }
         let reduced = |m: &Matrix6<f64>| twists.transpose() * m * &twists;
 
         let free = if information.adherence < ADHERENT {
@@ -77,7 +80,9 @@ impl Uncertainty {
 fn scatter(information: &Information, twists: &Matrix6xX<f64>, radius: f64) -> DMatrix<f64> {
     // Pairs of one patch err together, those of different ones do not.
     let pulls = information.patches.iter().map(|patch| twists.transpose() * patch.gradient);
-    let rounding = twists.transpose() * information.hessian * twists * (ROUNDING * radius).powi(2);
+    let firmest = (twists.transpose() * information.hessian * twists).trace();
+    let rounding =
+        DMatrix::identity(twists.ncols(), twists.ncols()) * (firmest * (ROUNDING * radius).powi(2));
     let mut scatter = pulls.fold(rounding, |sum, pull| sum + &pull * pull.transpose());
     // The pose has followed a share of each patch's error, and so has the residual that tells it.
     let (patches, unknowns) = (information.patches.len() as f64, twists.ncols() as f64);
@@ -86,7 +91,7 @@ fn scatter(information: &Information, twists: &Matrix6xX<f64>, radius: f64) -> D
     // rest as makes a step of that length an ordinary error.
     let pull = twists.transpose() * information.gradient;
     let unfinished = scatter.clone().cholesky().map_or(0.0, |s| pull.dot(&s.solve(&pull)));
-    scatter * (1.0 + unfinished / unknowns.max(1.0)) + &pull * pull.transpose()
+    scatter * (1.0 + unfinished / unknowns) + &pull * pull.transpose()
 }
 
 /// Smallest over largest eigenvalue of what both clouds' normals agree on.
