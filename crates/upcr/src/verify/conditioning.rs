@@ -46,7 +46,7 @@ impl Uncertainty {
         let twists = scale * &basis;
         let unknowns = basis.ncols();
         if unknowns == 0 {
-            return Self { covariance: Matrix6::zeros(), free: Matrix6xX::zeros(0) };
+            return Self { covariance: Matrix6::zeros(), free: Matrix6xX::zeros(0), conditioning: 1.0 };
         }
         let reduced = |m: &Matrix6<f64>| twists.transpose() * m * &twists;
 
