@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use anyhow::{Context, Result, bail};
+#[cfg(feature = "train")]
+use anyhow::Context;
+use anyhow::{Result, bail};
 use clap::ValueEnum;
 use upcr::{Settings, net::Network};
 use upcr_lab::data::Split;

@@ -24,7 +24,7 @@ head = [16]
 ";
 
 /// A folder with twelve boxes of different sides, each some points on its faces.
-fn shapes(scratch: &Scratch) -> String {
+pub(super) fn shapes(scratch: &Scratch) -> String {
     let folder = scratch.path("shapes");
     std::fs::create_dir(&folder).unwrap();
     let mut state = 1_u64;

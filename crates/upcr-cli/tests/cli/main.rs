@@ -3,7 +3,10 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
 mod bad_input;
+#[cfg(feature = "train")]
+mod calibrate;
 mod commands;
+#[cfg(feature = "train")]
 mod learning;
 mod register;
 

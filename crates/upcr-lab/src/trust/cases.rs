@@ -182,7 +182,7 @@ impl Material {
                 return Ok(case);
             }
         }
-        Err(Error::InvalidSetting { name: "data", reason: "all of it shares something".into() })
+        Err(invalid("all of it shares something"))
     }
 }
 
@@ -200,9 +200,13 @@ fn posed_files(folder: &Path) -> std::io::Result<Vec<(PathBuf, PathBuf)>> {
     Ok(found)
 }
 
+fn invalid(reason: &str) -> Error {
+    Error::InvalidSetting { name: "data", reason: reason.into() }
+}
+
 fn two<'a, T>(of: &'a [T], rng: &mut impl Rng) -> Result<[&'a T; 2]> {
     if of.len() < 2 {
-        return Err(Error::InvalidSetting { name: "data", reason: "two clouds are needed at least".into() });
+        return Err(invalid("two clouds are needed at least"));
     }
     let first = rng.random_range(0..of.len());
     let second = (first + rng.random_range(1..of.len())) % of.len();
@@ -248,23 +252,19 @@ fn kind_of_shapes(rng: &mut impl Rng) -> Kind {
 
 fn shape_case(shapes: &Shapes, kind: Kind, rng: &mut impl Rng) -> Result<Case> {
     let first = rng.random_range(0..shapes.len());
-    let other = |same: bool, rng: &mut dyn rand::RngCore| {
-        let label = shapes.labels[first];
-        let fits = |&i: &usize| i != first && (shapes.labels[i] == label) == same;
+    let mut another = |of_its_category: bool| {
+        let fits = |&i: &usize| i != first && (shapes.labels[i] == shapes.labels[first]) == of_its_category;
         let fitting: Vec<usize> = (0..shapes.len()).filter(fits).collect();
         fitting.choose(rng).copied()
     };
     let (second, kind) = match kind {
-        Kind::SameCategory => other(true, rng).map_or((None, Kind::Different), |i| (Some(i), kind)),
-        Kind::Different => (None, kind),
-        _ => (Some(first), kind),
-    };
-    let second = match second {
-        Some(second) => second,
-        None => other(false, rng).ok_or_else(|| Error::InvalidSetting {
-            name: "data",
-            reason: "shapes of two categories are needed at least".into(),
-        })?,
+        Kind::SameCategory | Kind::Different => {
+            // Where there is but one category, two of it are the most different things there are.
+            let second = another(kind == Kind::SameCategory).map(|i| (i, kind));
+            let second = second.or_else(|| another(kind == Kind::Different).map(|i| (i, Kind::Different)));
+            second.ok_or_else(|| invalid("two shapes are needed at least"))?
+        }
+        _ => (first, kind),
     };
     let count = shapes.clouds[first].len().min(shapes.clouds[second].len()) / 2;
     let mut halves = |index: usize| {

@@ -153,3 +153,57 @@ impl Calibration {
 fn invalid(reason: String) -> Error {
     Error::InvalidSetting { name: "calibration", reason }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn weighing(name: &str, weight: f64) -> Calibration {
+        let of = FEATURES.map(|feature| if feature == name { weight } else { 0.0 });
+        let weights = Weights::new(0.5, of);
+        Calibration { about: "test".into(), averages: Weights::new(-0.5, of), samples: weights }
+    }
+
+    #[test]
+    fn the_logit_is_the_intercept_and_what_is_weighed() {
+        let calibration = weighing("agreement", 2.0);
+        let evidence = Evidence { agreement: 0.25, ..Evidence::none(100) };
+        let logistic = |logit: f64| 1.0 / (1.0 + (-logit).exp());
+        assert_eq!(calibration.probability(&evidence), logistic(1.0));
+        assert_eq!(calibration.probability(&Evidence { samples: false, ..evidence }), logistic(0.0));
+    }
+
+    #[test]
+    fn features_stay_finite_whatever_the_evidence() {
+        let wild = Evidence {
+            residual_ratio: f64::INFINITY,
+            runner_up: f64::INFINITY,
+            glimpsed: f64::INFINITY,
+            rivals: usize::MAX,
+            inliers: usize::MAX,
+            points: 0,
+            matches: Some([0, 0]),
+            ..Evidence::none(0)
+        };
+        for evidence in [wild, Evidence::none(usize::MAX), Evidence { residual_ratio: 0.0, ..wild }] {
+            assert!(evidence.features().iter().all(|v| v.is_finite()), "{:?}", evidence.features());
+        }
+    }
+
+    #[test]
+    fn a_file_has_every_weight_and_no_other() {
+        let whole = serde_json::to_string(&weighing("margin", 1.5)).unwrap();
+        assert_eq!(Calibration::parse(&whole).unwrap(), weighing("margin", 1.5));
+        let broken = [
+            whole.replace("\"margin\"", "\"magic\""),
+            whole.replace("\"margin\":1.5,", ""),
+            whole.replace("1.5", "1e999"),
+            whole.replace("\"about\"", "\"abort\""),
+            whole[..whole.len() / 2].into(),
+        ];
+        for text in broken {
+            assert!(Calibration::parse(&text).is_err(), "{text}");
+        }
+        assert!(Calibration::embedded().is_ok());
+    }
+}
