@@ -20,7 +20,7 @@ pub enum Reason {
     LowOverlap,
     /// Another, different pose explains the clouds nearly as well.
     Ambiguous,
-    /// Some direction of motion is not held by the geometry (a plane, a cylinder, a corridor).
+    /// Some motion is not held by the geometry: those in [`Registration::free_directions`].
     DegenerateAxis,
     /// Too few points to tell.
     TooFewPoints,
