@@ -25,7 +25,7 @@ fn square_table(seed: u64) -> PointCloud {
                 2 => (0.05, y),
                 _ => (-0.05, y),
             };
-            let side = |bit: usize| if i / 8 >> bit & 1 == 0 { 0.42 } else { -0.42 };
+            let side = |bit: usize| if ((i / 8) >> bit) & 1 == 0 { 0.42 } else { -0.42 };
             [x + side(0), y + side(1), z]
         };
         points.push(p.map(|v| v + within(-0.003, 0.003)));

@@ -73,9 +73,9 @@ mod tests {
     fn drawn(count: u64) -> Vec<(Observed, f64)> {
         let one = |index| {
             let mut rng = random::stream(5, index);
-            let overlap = rng.random_range(0.0..1.0);
-            let closeness = rng.random_range(0.0..1.0);
-            let p = 1.0 / (1.0 + (8.0 - 6.0 * overlap - 10.0 * closeness as f64).exp());
+            let overlap: f64 = rng.random_range(0.0..1.0);
+            let closeness: f64 = rng.random_range(0.0..1.0);
+            let p = 1.0 / (1.0 + (8.0 - 6.0 * overlap - 10.0 * closeness).exp());
             let evidence = Evidence { overlap: [overlap; 2], closeness, ..Evidence::none(500) };
             let right = rng.random_bool(p);
             (Observed { kind: Kind::Partial, right, probability: 0.0, evidence, reasons: Vec::new() }, p)
