@@ -64,17 +64,17 @@ mod tests {
     use super::*;
 
     const GOOD: Evidence = Evidence {
-        overlap: [0.8, 0.8],
-        inliers: 1000,
-        closeness: 0.75,
-        residual_ratio: 0.9,
+        overlap: [0.7, 0.7],
+        inliers: 2500,
+        closeness: 0.52,
+        residual_ratio: 1.1,
         near_misses: 0.2,
-        facing: [0.9, 0.95],
+        facing: [0.8, 0.85],
         runner_up: 0.5,
-        glimpsed: 0.5,
+        glimpsed: 0.6,
         rivals: 0,
         agreement: 0.5,
-        matches: Some([200, 800]),
+        matches: Some([60, 800]),
         conditioning: 0.02,
         free_directions: 0,
         converged: true,
@@ -97,17 +97,22 @@ mod tests {
         let cases = [
             (Evidence { overlap: [0.02, 0.03], ..GOOD }, Reason::NoOverlap),
             (Evidence { inliers: 5, ..GOOD }, Reason::TooFewPoints),
-            (Evidence { overlap: [0.2, 0.2], ..GOOD }, Reason::LowOverlap),
             (Evidence { rivals: 1, ..GOOD }, Reason::Ambiguous),
             (Evidence { free_directions: 1, ..GOOD }, Reason::DegenerateAxis),
             (Evidence { points: 20, ..GOOD }, Reason::TooFewPoints),
-            (Evidence { closeness: 0.3, ..GOOD }, Reason::PoorFit),
+            (Evidence { closeness: 0.35, near_misses: 0.6, ..GOOD }, Reason::PoorFit),
         ];
         for (evidence, reason) in cases {
             let verdict = verdict_on(&evidence);
             assert!(verdict.reasons.contains(&reason), "{evidence:?}: {verdict:?}");
             assert!(verdict.probability < verdict_on(&GOOD).probability, "{evidence:?}: {verdict:?}");
         }
+    }
+
+    #[test]
+    fn little_overlap_is_told_whatever_the_probability() {
+        let verdict = verdict_on(&Evidence { overlap: [0.2, 0.25], ..GOOD });
+        assert_eq!(verdict.reasons, [Reason::LowOverlap]);
     }
 
     #[test]
