@@ -88,16 +88,21 @@ pub fn register_watched(
     on_threads(settings.threads, || run(source, target, settings, &call))?
 }
 
+/// A coarsely refined pose with its score.
+#[derive(Clone, Copy)]
+struct Glimpse {
+    score: f64,
+    pose: Rigid,
+    /// Whether a source proposed it, and not only a turn.
+    proposed: bool,
+}
+
 /// A refined pose with its score.
 struct Candidate {
     method: Method,
     refined: Refined,
     score: f64,
     closeness: f64,
-    /// Share of the hypotheses, coarsely refined, that came here.
-    agreement: f64,
-    /// Score of the best clearly different pose over that of this one, both coarsely refined.
-    glimpsed: f64,
     /// Whether it was refined to the end, and so was all that its source proposed beside it.
     complete: bool,
 }
@@ -238,6 +243,7 @@ struct Pipeline<'a> {
     init: Rigid,
     lock: Option<LockedPose>,
     matches: Vec<Match>,
+    glimpses: Vec<Glimpse>,
     candidates: Vec<Candidate>,
     calibration: Arc<Calibration>,
     timings: Timings,
@@ -259,6 +265,7 @@ impl<'a> Pipeline<'a> {
             init,
             lock,
             matches: Vec::new(),
+            glimpses: Vec::new(),
             candidates: Vec::new(),
             calibration: settings.calibration.clone().map_or_else(Calibration::embedded, Ok)?,
             timings: Timings::default(),
@@ -298,7 +305,8 @@ impl<'a> Pipeline<'a> {
             self.timings.hypotheses += milliseconds(start);
             begin(Stage::Refine, (PROPOSED, REFINED));
             let start = Instant::now();
-            let refined = self.refined(&hypotheses);
+            let (refined, glimpses) = self.refined(&hypotheses);
+            self.glimpses.extend(glimpses);
             let complete = self.call.ended_by().is_none();
             self.candidates.extend(refined.into_iter().map(|c| Candidate { complete, ..c }));
             self.candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
@@ -343,6 +351,11 @@ impl<'a> Pipeline<'a> {
         Ok(match_levels((a, &da?), (b, &db?)))
     }
 
+    /// Whether the points are samples as they were taken, not averages of many.
+    fn samples(&self) -> bool {
+        self.source.fine.sparse && self.target.fine.sparse
+    }
+
     /// Distance between matched points under a right pose, at most.
     fn match_tolerance(&self) -> f32 {
         TOLERANCE_VOXELS * self.source.coarse().voxel_size.max(self.target.coarse().voxel_size)
@@ -361,10 +374,10 @@ impl<'a> Pipeline<'a> {
     }
 
     /// Ranks hypotheses by overlap, refines the best coarsely, ranks again, beside turns of the best, and refines
-    /// the best of those finely.
-    fn refined(&self, hypotheses: &[Hypothesis]) -> Vec<Candidate> {
+    /// the best of those finely. Beside these, all that was refined coarsely.
+    fn refined(&self, hypotheses: &[Hypothesis]) -> (Vec<Candidate>, Vec<Glimpse>) {
         let (source, target) = (self.source.coarse(), self.target.coarse());
-        let limit = REACH_VOXELS * source.voxel_size.max(target.voxel_size);
+        let limit = self.coarse_reach();
         let rank = |pose: &Rigid, points: usize| overlap_at(source, target, pose, points, limit).score(2);
         let promising = |hypotheses: &[Hypothesis], points: usize, share: f64, of: f64| {
             let mut ranked: Vec<(f64, Hypothesis)> =
@@ -393,7 +406,10 @@ impl<'a> Pipeline<'a> {
             if hypotheses.len() > few && self.call.is_over() { &hypotheses[..few] } else { hypotheses };
         let mut ranked = coarsely_refined(promising(hypotheses, RANKING_POINTS, PROMISING, 0.0));
         ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let proposed: Vec<Rigid> = ranked.iter().map(|(_, h)| h.pose).collect();
+        let glimpsed = |ranked: &[(f64, Hypothesis)], proposed| -> Vec<Glimpse> {
+            ranked.iter().map(|&(score, h)| Glimpse { score, pose: h.pose, proposed }).collect()
+        };
+        let mut glimpses = glimpsed(&ranked, true);
         if let Some((score, best)) = ranked.first()
             && *score < COINCIDENT
             && !self.call.is_over()
@@ -401,19 +417,18 @@ impl<'a> Pipeline<'a> {
             let turns: Vec<Hypothesis> =
                 turned(source, &best.pose).into_iter().map(|pose| Hypothesis { pose, ..*best }).collect();
             let others = promising(&turns, GLANCING_POINTS, TELLING, *score);
-            ranked.extend(coarsely_refined(others));
+            let others = coarsely_refined(others);
+            glimpses.extend(glimpsed(&others, false));
+            ranked.extend(others);
             ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
         }
-        let radius = f64::from(self.source.fine.radius);
-        let same = |a: &Rigid, b: &Rigid| separation(a, b, radius) <= f64::from(limit);
         let mut distinct: Vec<(f64, Hypothesis)> = Vec::new();
         for (score, h) in ranked {
-            if distinct.iter().all(|(_, d)| !same(&d.pose, &h.pose)) {
+            if distinct.iter().all(|(_, d)| !self.coarsely_same(&d.pose, &h.pose)) {
                 distinct.push((score, h));
             }
         }
         let best = distinct.first().map_or(0.0, |best| best.0);
-        let second = distinct.get(1).map_or(0.0, |second| second.0);
         let worth_it = |rank: usize, score: f64| {
             let enough = if rank < FINE_CANDIDATES { PROMISING } else { RIVALLING };
             rank < RIVALS && score >= enough * best
@@ -422,16 +437,33 @@ impl<'a> Pipeline<'a> {
             distinct.iter().enumerate().take_while(|(rank, (score, _))| worth_it(*rank, *score)).count();
         let going_on = |&(rank, _): &(usize, _)| rank == 0 || !self.call.is_over();
         let fine = distinct[..count].iter().enumerate().take_while(going_on);
-        fine.map(|(rank, (score, h))| {
+        let candidates = fine.map(|(rank, (_, h))| {
             self.call.advance(rank as f64 / count as f64);
-            let agreeing = proposed.iter().filter(|pose| same(pose, &h.pose)).count();
-            Candidate {
-                agreement: agreeing as f64 / proposed.len().max(1) as f64,
-                glimpsed: if rank == 0 { second } else { best } / score.max(f64::MIN_POSITIVE),
-                ..self.finely_refined(h)
-            }
-        })
-        .collect()
+            self.finely_refined(h)
+        });
+        (candidates.collect(), glimpses)
+    }
+
+    /// Distance within which points of the coarse level count as near.
+    fn coarse_reach(&self) -> f32 {
+        REACH_VOXELS * self.source.coarse().voxel_size.max(self.target.coarse().voxel_size)
+    }
+
+    /// Whether two poses, coarsely refined, are one answer.
+    fn coarsely_same(&self, a: &Rigid, b: &Rigid) -> bool {
+        separation(a, b, f64::from(self.source.fine.radius)) <= f64::from(self.coarse_reach())
+    }
+
+    /// How far the sources agree on `pose`, and the coarse score of the best other pose over its own.
+    fn glimpsed(&self, pose: &Rigid) -> (f64, f64) {
+        let (source, target) = (self.source.coarse(), self.target.coarse());
+        let here = overlap_at(source, target, pose, COMPARING_POINTS, self.coarse_reach()).score(2);
+        let (same, others): (Vec<&Glimpse>, Vec<&Glimpse>) =
+            self.glimpses.iter().partition(|glimpse| self.coarsely_same(&glimpse.pose, pose));
+        let proposed = |glimpses: &[&Glimpse]| glimpses.iter().filter(|g| g.proposed).count();
+        let (agreeing, not) = (proposed(&same), proposed(&others));
+        let best_other = others.iter().map(|glimpse| glimpse.score).fold(0.0, f64::max);
+        (agreeing as f64 / (agreeing + not).max(1) as f64, best_other / here.max(f64::MIN_POSITIVE))
     }
 
     fn finely_refined(&self, hypothesis: &Hypothesis) -> Candidate {
@@ -467,15 +499,7 @@ impl<'a> Pipeline<'a> {
         let score = overlap.score(SCORING_SCALES);
         let closeness = score / overlap.score(1).max(f64::MIN_POSITIVE);
         // Walls that slide along each other overlap more than those that stand where they belong, but less closely.
-        Candidate {
-            method: hypothesis.method,
-            refined,
-            score: score * closeness,
-            closeness,
-            agreement: 0.0,
-            glimpsed: 0.0,
-            complete: true,
-        }
+        Candidate { method: hypothesis.method, refined, score: score * closeness, closeness, complete: true }
     }
 
     /// The best candidate with the verdict on it.
@@ -494,19 +518,20 @@ impl<'a> Pipeline<'a> {
         let forward = meeting(source, &held_out(self.source), target, pose, limit);
         let backward = meeting(target, &held_out(self.target), source, &pose.inverse(), limit);
         let uncertainty = self.uncertainty(pose);
+        let (agreement, glimpsed) = self.glimpsed(pose);
         let tolerance = self.match_tolerance();
         let explained = |matches: &[Match]| matches.iter().filter(|m| m.agrees_with(pose, tolerance)).count();
         let evidence = Evidence {
             closeness: best.closeness,
             runner_up: others.first().map_or(0.0, |c| relative(c)),
             rivals: others.iter().filter(|c| relative(c) >= RIVALLING).count(),
-            glimpsed: best.glimpsed,
-            agreement: best.agreement,
+            glimpsed,
+            agreement,
             matches: (!self.matches.is_empty()).then(|| [explained(&self.matches), self.matches.len()]),
             conditioning: uncertainty.conditioning,
             free_directions: uncertainty.free.ncols(),
             converged: best.refined.converged || self.settings.refine == Refinement::None,
-            samples: source.sparse && target.sparse,
+            samples: self.samples(),
             ..Evidence::none(source.points.len().min(target.points.len()))
         };
         let evidence = seen([&forward, &backward], limit, evidence);
@@ -581,7 +606,7 @@ impl<'a> Pipeline<'a> {
             None => Matrix6xX::identity(6),
         };
         match icp.information(&moved, pose, &schedule) {
-            Some(information) => Uncertainty::of(&information, &tangent, radius),
+            Some(information) => Uncertainty::of(&information, &tangent, radius, self.samples()),
             None => Uncertainty::unknown(radius),
         }
     }

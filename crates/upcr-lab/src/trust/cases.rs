@@ -459,7 +459,7 @@ fn virtual_place(rng: &mut impl Rng) -> Result<Place> {
     };
     let mut settings = SynthSettings::new(scene);
     settings.seed = rng.random();
-    settings.scans = 4;
+    settings.scans = 6;
     settings.overlap = rng.random_range(0.3..0.9);
     if let Optics::DepthCamera(camera) = &mut settings.sensor.optics {
         *camera = camera.resized(320, 240);

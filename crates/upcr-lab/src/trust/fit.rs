@@ -6,6 +6,10 @@ use upcr::{Calibration, FEATURES, Weights};
 use super::observe::Observed;
 
 const COUNT: usize = FEATURES.len();
+/// Which way each of [`FEATURES`] speaks: for the pose (1), against it (-1), or either way (0). Evidence that among the
+/// training pairs seems to speak the other way does so by way of other evidence, and gets no weight of its own.
+const SPEAKS: [f64; COUNT] =
+    [1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, -1.0, -1.0];
 /// Ridge on the weights of standardised features: keeps them finite where a feature tells right from wrong alone.
 const RIDGE: f64 = 0.1;
 /// Pairs without which nothing is fitted.
@@ -34,18 +38,42 @@ fn weights(observed: &[&Observed]) -> Weights {
     let scale = variance.map(|v| if v > 1e-12 { 1.0 / v.sqrt() } else { 0.0 });
     let standard: Vec<SVector<f64, COUNT>> = rows.iter().map(|r| (r - mean).component_mul(&scale)).collect();
 
-    // Intercept first.
-    let mut weights = DVector::<f64>::zeros(COUNT + 1);
-    for _ in 0..STEPS {
-        let mut gradient = DVector::<f64>::zeros(COUNT + 1);
-        let mut hessian = DMatrix::<f64>::zeros(COUNT + 1, COUNT + 1);
-        for (row, o) in standard.iter().zip(observed) {
-            let x = DVector::from_iterator(COUNT + 1, std::iter::once(1.0).chain(row.iter().copied()));
-            let p = 1.0 / (1.0 + (-weights.dot(&x)).exp());
-            gradient += &x * (p - f64::from(o.right));
-            hessian += &x * x.transpose() * (p * (1.0 - p)).max(1e-9);
+    let right: Vec<bool> = observed.iter().map(|o| o.right).collect();
+    let mut kept: Vec<usize> = (0..COUNT).filter(|&k| scale[k] > 0.0).collect();
+    let (intercept, standard_weights) = loop {
+        let solved = newton(&standard, &right, &kept);
+        let contrary = |(at, k): (usize, &usize)| (SPEAKS[*k] * solved[at + 1], at);
+        let worst = kept.iter().enumerate().map(contrary).min_by(|a, b| a.0.total_cmp(&b.0));
+        match worst {
+            Some((spoken, at)) if spoken < 0.0 => drop(kept.remove(at)),
+            _ => {
+                let mut weights = [0.0; COUNT];
+                for (k, weight) in kept.iter().zip(solved.iter().skip(1)) {
+                    weights[*k] = *weight;
+                }
+                break (solved[0], weights);
+            }
         }
-        for k in 1..=COUNT {
+    };
+    let plain: [f64; COUNT] = std::array::from_fn(|k| standard_weights[k] * scale[k]);
+    let shift: f64 = plain.iter().zip(mean.iter()).map(|(w, m)| w * m).sum();
+    Weights::new(intercept - shift, plain)
+}
+
+/// Intercept and weights of the features `kept` that make `right` most probable.
+fn newton(rows: &[SVector<f64, COUNT>], right: &[bool], kept: &[usize]) -> DVector<f64> {
+    let count = kept.len() + 1;
+    let mut weights = DVector::<f64>::zeros(count);
+    for _ in 0..STEPS {
+        let mut gradient = DVector::<f64>::zeros(count);
+        let mut hessian = DMatrix::<f64>::zeros(count, count);
+        for (row, right) in rows.iter().zip(right) {
+            let x = DVector::from_iterator(count, std::iter::once(1.0).chain(kept.iter().map(|&k| row[k])));
+            let p = 1.0 / (1.0 + (-weights.dot(&x)).exp());
+            gradient.axpy(p - f64::from(*right), &x, 1.0);
+            hessian.ger((p * (1.0 - p)).max(1e-9), &x, &x, 1.0);
+        }
+        for k in 1..count {
             gradient[k] += RIDGE * weights[k];
             hessian[(k, k)] += RIDGE;
         }
@@ -55,9 +83,7 @@ fn weights(observed: &[&Observed]) -> Weights {
             break;
         }
     }
-    let plain: [f64; COUNT] = std::array::from_fn(|k| weights[k + 1] * scale[k]);
-    let shift: f64 = plain.iter().zip(mean.iter()).map(|(w, m)| w * m).sum();
-    Weights::new(weights[0] - shift, plain)
+    weights
 }
 
 #[cfg(test)]

@@ -15,7 +15,6 @@ const EMBEDDED: &str = include_str!("calibration.json");
 /// What [`Evidence`] becomes before it is weighed, one number each.
 pub const FEATURES: [&str; 18] = [
     "smaller_overlap",
-    "larger_overlap",
     "closeness",
     "ln_residual_ratio",
     "near_misses",
@@ -32,6 +31,7 @@ pub const FEATURES: [&str; 18] = [
     "ln_points",
     "ln_conditioning",
     "has_free_direction",
+    "not_converged",
 ];
 
 impl Evidence {
@@ -43,7 +43,6 @@ impl Evidence {
         let [facing, own_facing] = self.facing;
         [
             source.min(target),
-            source.max(target),
             self.closeness,
             self.residual_ratio.max(f64::MIN_POSITIVE).ln().clamp(-3.0, 3.0),
             self.near_misses,
@@ -58,8 +57,9 @@ impl Evidence {
             f64::from(self.matches.is_none()),
             (self.inliers as f64).ln_1p(),
             (self.points.max(1) as f64).ln(),
-            self.conditioning.max(1e-6).ln(),
+            self.conditioning.clamp(1e-5, 5e-3).ln(),
             f64::from(self.free_directions > 0),
+            f64::from(!self.converged),
         ]
     }
 }

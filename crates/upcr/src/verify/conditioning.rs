@@ -10,6 +10,9 @@ use crate::refine::{Information, Patch};
 /// alone would feign, or than this share of what they agree on about the best held one.
 const BY_CHANCE: f64 = 0.35;
 const NEGLIGIBLE: f64 = 5e-4;
+/// The same where points are averages of many, whose errors are smaller: of training pairs with less, hardly one in ten had the
+/// right pose.
+const NEGLIGIBLE_OF_AVERAGES: f64 = 1.5e-3;
 /// Where this share of a slide pulls pairs apart, the samples hold the pose, whatever the shape does.
 const ADHERENT: f64 = 0.3;
 /// Residuals are taken as no better known than this share of the radius: single precision has no more.
@@ -37,7 +40,9 @@ impl Uncertainty {
     }
 
     /// Of a pose that may move along the columns of `tangent` (twists).
-    pub fn of(information: &Information, tangent: &Matrix6xX<f64>, radius: f64) -> Self {
+    ///
+    /// `samples`: whether points are samples as they were taken.
+    pub fn of(information: &Information, tangent: &Matrix6xX<f64>, radius: f64, samples: bool) -> Self {
         // Lengths at the rim in place of angles, so that all coordinates of a twist have one unit; of these twists an
         // orthonormal basis of the possible ones, in which all that follows is written.
         let scale = rotation_scale(radius);
@@ -51,7 +56,7 @@ impl Uncertainty {
         let reduced = |m: &Matrix6<f64>| twists.transpose() * m * &twists;
 
         let free = if information.adherence < ADHERENT {
-            free(information, &reduced)
+            free(information, &reduced, if samples { NEGLIGIBLE } else { NEGLIGIBLE_OF_AVERAGES })
         } else {
             DMatrix::zeros(unknowns, 0)
         };
@@ -102,11 +107,15 @@ fn conditioning(information: &Information, reduced: &impl Fn(&Matrix6<f64>) -> D
 }
 
 /// Orthonormal basis of the motions that the surfaces do not resist, in the reduced coordinates.
-fn free(information: &Information, reduced: &impl Fn(&Matrix6<f64>) -> DMatrix<f64>) -> DMatrix<f64> {
+fn free(
+    information: &Information,
+    reduced: &impl Fn(&Matrix6<f64>) -> DMatrix<f64>,
+    negligible: f64,
+) -> DMatrix<f64> {
     let sum = |of: fn(&Patch) -> Matrix6<f64>| reduced(&information.patches.iter().map(of).sum());
     let (agreement, disagreement) = (sum(|p| p.agreement), sum(|p| p.disagreement));
     let eigen = SymmetricEigen::new(agreement);
-    let negligible = NEGLIGIBLE * eigen.eigenvalues.max();
+    let negligible = negligible * eigen.eigenvalues.max();
     let motions = eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter());
     let free: Vec<DVector<f64>> = motions
         .filter(|(agreed, motion)| {
@@ -187,7 +196,7 @@ mod tests {
             let error =
                 hessian.cholesky().unwrap().solve(&rows.iter().zip(&noise).map(|(a, e)| a * *e).sum());
             let pulls: Vec<f64> = rows.iter().zip(&noise).map(|(a, e)| a.dot(&error) - e).collect();
-            let found = Uncertainty::of(&information(&rows, &pulls, 0.0), &all(), RADIUS);
+            let found = Uncertainty::of(&information(&rows, &pulls, 0.0), &all(), RADIUS, true);
             assert_eq!(found.free.ncols(), 0);
             total += error.dot(&found.covariance.cholesky().unwrap().solve(&error));
         }
@@ -203,7 +212,7 @@ mod tests {
         let step = Vector6::new(0.1, -0.05, 0.02, 0.2, -0.1, 0.3);
         let noise = 1e-3;
         let pulls: Vec<f64> = rows.iter().map(|a| noise * normal(&mut rng) - a.dot(&step)).collect();
-        let found = Uncertainty::of(&information(&rows, &pulls, 0.0), &all(), RADIUS);
+        let found = Uncertainty::of(&information(&rows, &pulls, 0.0), &all(), RADIUS, true);
         let nees = step.dot(&found.covariance.cholesky().unwrap().solve(&step));
         assert!(nees < 6.0, "{nees} with {hessian}");
     }
@@ -215,7 +224,7 @@ mod tests {
             .map(|_| row(Vector3::new(normal(&mut rng), normal(&mut rng), 0.0), Vector3::z()))
             .collect();
         let pulls: Vec<f64> = rows.iter().map(|_| 0.01 * normal(&mut rng)).collect();
-        let found = Uncertainty::of(&information(&rows, &pulls, 0.05), &all(), RADIUS);
+        let found = Uncertainty::of(&information(&rows, &pulls, 0.05), &all(), RADIUS, true);
         assert_eq!(found.free.ncols(), 3);
         assert!((found.free.transpose() * &found.free - DMatrix::identity(3, 3)).amax() < 1e-12);
         // Turning about z, sliding along x and y.
@@ -237,10 +246,10 @@ mod tests {
         tangent[(2, 0)] = 1.0;
         tangent[(4, 0)] = 0.5;
         tangent[(3, 1)] = 1.0;
-        let found = Uncertainty::of(&information, &tangent, RADIUS).covariance;
+        let found = Uncertainty::of(&information, &tangent, RADIUS, true).covariance;
         assert!([0, 1, 5].iter().all(|&k| found.row(k).amax() < 1e-15), "{found}");
         assert!(found[(2, 2)] > 0.0 && (found[(2, 4)] / found[(2, 2)] - 0.5).abs() < 1e-9, "{found}");
-        let nothing = Uncertainty::of(&information, &Matrix6xX::zeros(0), RADIUS);
+        let nothing = Uncertainty::of(&information, &Matrix6xX::zeros(0), RADIUS, true);
         assert_eq!((nothing.covariance.amax(), nothing.free.ncols()), (0.0, 0));
     }
 }
