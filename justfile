@@ -43,7 +43,10 @@ compare *args:
 
 # Fuzz every reader and the registration for so many seconds in all
 fuzz seconds="3600":
-    fuzz/run "$(( {{ seconds }} * $(nproc) / $(ls fuzz/fuzz_targets | wc -l) ))"
+    #!/usr/bin/env bash
+    targets=$(ls fuzz/fuzz_targets | wc -l)
+    beside=$(( $(nproc) < targets ? $(nproc) : targets ))
+    fuzz/run "$(( {{ seconds }} * beside / targets + 1 ))"
 
 # Register so many degenerate pairs
 degenerate count="50000":

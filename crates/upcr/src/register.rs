@@ -49,6 +49,8 @@ const FEW_POINTS: usize = 1500;
 const FINE_POINTS: usize = 6000;
 /// Scales over which refined poses are compared, each half the one before.
 const SCORING_SCALES: u32 = 4;
+/// Scores relative to another are told up to this.
+const MOST_RELATIVE: f64 = 10.0;
 /// Poses closer than this many voxels at the source's rim are one answer.
 const DISTINCT_VOXELS: f64 = 6.0;
 /// Held-out points that are looked at although the time is up: they take a few milliseconds.
@@ -114,6 +116,7 @@ fn run(source: &PointCloud, target: &PointCloud, settings: &Settings, call: &Cal
         let sizes = Sizes::of(source, target);
         found.source_scale = fitting_scale(&sizes, source, target, settings, call);
         if found.source_scale.is_some() || sizes.are_far_apart() {
+            found.reasons.retain(|reason| *reason != Reason::PoorFit);
             found.reasons.insert(0, Reason::ScaleMismatch);
         }
     }
@@ -134,11 +137,28 @@ fn fitting_scale(
     settings: &Settings,
     call: &Call,
 ) -> Option<f64> {
-    let plain = Settings { init: None, locks: Locks::default(), voxel_size: None, ..settings.clone() };
-    sizes.factors().into_iter().find(|&factor| {
-        let fits = run_as_is(&scaled(source, factor), &scaled(target, 1.0), &plain, &call.aside());
-        fits.is_ok_and(|fits| fits.is_trustworthy())
-    })
+    // A guess at the wrong scale is none at the right one.
+    let method = if settings.method == Method::Prior { Method::Auto } else { settings.method };
+    let plain =
+        Settings { method, init: None, locks: Locks::default(), voxel_size: None, ..settings.clone() };
+    let factors = sizes.factors();
+    if factors.is_empty() {
+        return None;
+    }
+    let target = scaled(target, 1.0);
+    for factor in factors {
+        let aside = call.aside();
+        let fits = run_as_is(&scaled(source, factor), &target, &plain, &aside);
+        if aside.ended_by().is_some() {
+            // What ends the question ends the call, which finds that out by asking.
+            call.is_over();
+            return None;
+        }
+        if fits.is_ok_and(|fits| fits.is_trustworthy()) {
+            return Some(factor);
+        }
+    }
+    None
 }
 
 /// The pose at the scale that the clouds have.
@@ -463,7 +483,8 @@ impl<'a> Pipeline<'a> {
         let proposed = |glimpses: &[&Glimpse]| glimpses.iter().filter(|g| g.proposed).count();
         let (agreeing, not) = (proposed(&same), proposed(&others));
         let best_other = others.iter().map(|glimpse| glimpse.score).fold(0.0, f64::max);
-        (agreeing as f64 / (agreeing + not).max(1) as f64, best_other / here.max(f64::MIN_POSITIVE))
+        let relative = if best_other == 0.0 { 0.0 } else { (best_other / here).min(MOST_RELATIVE) };
+        (agreeing as f64 / (agreeing + not).max(1) as f64, relative)
     }
 
     fn finely_refined(&self, hypothesis: &Hypothesis) -> Candidate {
@@ -507,7 +528,7 @@ impl<'a> Pipeline<'a> {
         let radius = f64::from(self.source.fine.radius);
         let Some(best) = self.candidates.first() else { return self.nothing_found() };
         let pose = &best.refined.pose;
-        let relative = |c: &Candidate| c.score / best.score.max(f64::MIN_POSITIVE);
+        let relative = |c: &Candidate| (c.score / best.score.max(f64::MIN_POSITIVE)).min(MOST_RELATIVE);
         let others = self.others(best);
         let (source, target) = (&self.source.fine, &self.target.fine);
         let limit = self.voxel_size as f32;

@@ -124,6 +124,11 @@ impl Settings {
         {
             return refused("max_seconds", format!("must be a time of at least 0 s, not {seconds}"));
         }
+        if let Some(calibration) = &self.calibration
+            && let Err(reason) = calibration.check()
+        {
+            return refused("calibration", reason);
+        }
         if let Some(init) = &self.init
             && let Err(reason) = Rigid::from_rows(&init.to_rows())
         {

@@ -54,7 +54,8 @@ fn a_square_table_has_four_poses_and_says_so() {
             })
             .collect();
         turns.sort_by(f64::total_cmp);
-        let near = |angle: f64| turns.iter().any(|t| (t - angle + 180.0).rem_euclid(360.0) - 180.0 < 2.0);
+        let near =
+            |angle: f64| turns.iter().any(|t| ((t - angle + 180.0).rem_euclid(360.0) - 180.0).abs() < 2.0);
         assert_eq!(turns.len(), 4, "{turns:?}");
         assert!([0.0, 90.0, 180.0, 270.0].into_iter().all(near), "{turns:?}");
         // Best first.

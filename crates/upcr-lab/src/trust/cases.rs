@@ -223,7 +223,7 @@ fn moved(points: &[[f64; 3]], by: &Rigid) -> PointCloud {
 }
 
 /// At most `count` of the points, evenly spread.
-fn thinned(points: &[[f64; 3]], count: usize) -> Vec<[f64; 3]> {
+fn thinned<T: Copy>(points: &[T], count: usize) -> Vec<T> {
     points.iter().step_by(points.len().div_ceil(count).max(1)).copied().collect()
 }
 
@@ -346,11 +346,7 @@ fn overlap(a: &[[f64; 3]], b: &[[f64; 3]], limit: f64) -> f64 {
         points.iter().filter(|&&p| tree.nearest(p, limit_sq).is_some()).count() as f64
             / points.len().max(1) as f64
     };
-    share(&a, &tree_b).max(share(&thin(&b, 3000), &tree_a))
-}
-
-fn thin(points: &[[f32; 3]], count: usize) -> Vec<[f32; 3]> {
-    points.iter().step_by(points.len().div_ceil(count).max(1)).copied().collect()
+    share(&a, &tree_b).max(share(&thinned(&b, 3000), &tree_a))
 }
 
 /// Two scans of one place, the source turned.

@@ -58,10 +58,10 @@ pub struct Coverage {
     pub right: usize,
     /// Of these, the ones with the true pose in the 95 % ellipsoid.
     pub covered: usize,
-    /// `covered / right`.
-    pub share: f64,
+    /// `covered / right`; none where no pose is right.
+    pub share: Option<f64>,
     /// Mean over the right ones of ξᵀ C⁻¹ ξ (normalised estimation error squared); 6 where C is true.
-    pub mean_nees: f64,
+    pub mean_nees: Option<f64>,
 }
 
 /// Registers `pairs` pairs of all kinds in fixed proportions; the first entry is over all of them.
@@ -89,13 +89,14 @@ impl Coverage {
     fn of(kind: Option<Kind>, outcomes: &[Option<f64>]) -> Self {
         let right: Vec<f64> = outcomes.iter().copied().flatten().collect();
         let covered = right.iter().filter(|nees| **nees <= CHI_SQUARE_95).count();
+        let share = |of: f64| (!right.is_empty()).then(|| of / right.len() as f64);
         Self {
             kind,
             pairs: outcomes.len(),
             right: right.len(),
             covered,
-            share: covered as f64 / right.len() as f64,
-            mean_nees: right.iter().sum::<f64>() / right.len() as f64,
+            share: share(covered as f64),
+            mean_nees: share(right.iter().sum::<f64>()),
         }
     }
 }

@@ -1,7 +1,7 @@
 //! Logistic regression of right and wrong over the evidence.
 
 use nalgebra::{DMatrix, DVector, SVector};
-use upcr::{Calibration, FEATURES, Weights};
+use upcr::{Calibration, Error, FEATURES, Result, Weights};
 
 use super::observe::Observed;
 
@@ -20,15 +20,19 @@ const SETTLED: f64 = 1e-9;
 
 /// The calibration under which what was seen of the poses is most probable, given which of them were right. Of clouds
 /// whose like was hardly seen the weights stay those of `default`.
-pub fn fit(observed: &[Observed], default: &Calibration, about: String) -> Calibration {
-    let of = |samples: bool, default: &Weights| {
+///
+/// # Errors
+/// Where no finite weights are found.
+pub fn fit(observed: &[Observed], default: &Calibration, about: String) -> Result<Calibration> {
+    let of = |samples: bool, default: &Weights| -> Result<Weights> {
         let seen: Vec<&Observed> = observed.iter().filter(|o| o.evidence.samples == samples).collect();
-        if seen.len() < FEWEST { default.clone() } else { weights(&seen) }
+        if seen.len() < FEWEST { Ok(default.clone()) } else { weights(&seen) }
     };
-    Calibration { about, samples: of(true, &default.samples), averages: of(false, &default.averages) }
+    let (samples, averages) = (of(true, &default.samples)?, of(false, &default.averages)?);
+    Ok(Calibration { about, samples, averages })
 }
 
-fn weights(observed: &[&Observed]) -> Weights {
+fn weights(observed: &[&Observed]) -> Result<Weights> {
     let rows: Vec<SVector<f64, COUNT>> = observed.iter().map(|o| o.evidence.features().into()).collect();
     let n = rows.len().max(1) as f64;
     let mean = rows.iter().sum::<SVector<f64, COUNT>>() / n;
@@ -57,7 +61,13 @@ fn weights(observed: &[&Observed]) -> Weights {
     };
     let plain: [f64; COUNT] = std::array::from_fn(|k| standard_weights[k] * scale[k]);
     let shift: f64 = plain.iter().zip(mean.iter()).map(|(w, m)| w * m).sum();
-    Weights::new(intercept - shift, plain)
+    if !(intercept - shift).is_finite() || plain.iter().any(|weight| !weight.is_finite()) {
+        return Err(Error::InvalidSetting {
+            name: "data",
+            reason: "no finite weights explain these pairs".into(),
+        });
+    }
+    Ok(Weights::new(intercept - shift, plain))
 }
 
 /// Intercept and weights of the features `kept` that make `right` most probable.
@@ -113,7 +123,7 @@ mod tests {
     fn the_law_that_draws_right_and_wrong_is_found() {
         let drawn = drawn(4000);
         let observed: Vec<Observed> = drawn.iter().map(|(o, _)| o.clone()).collect();
-        let calibration = fit(&observed, &Calibration::embedded().unwrap(), "test".into());
+        let calibration = fit(&observed, &Calibration::embedded().unwrap(), "test".into()).unwrap();
         let off =
             drawn.iter().map(|(o, p)| (calibration.probability(&o.evidence) - p).abs()).fold(0.0, f64::max);
         assert!(off < 0.08, "{off}");
@@ -122,10 +132,20 @@ mod tests {
     }
 
     #[test]
+    fn no_weight_in_the_library_speaks_against_its_meaning() {
+        let calibration = Calibration::embedded().unwrap();
+        for weights in [&calibration.samples, &calibration.averages] {
+            let contrary =
+                FEATURES.iter().zip(SPEAKS).find(|(name, speaks)| speaks * weights.of[**name] < 0.0);
+            assert_eq!(contrary, None);
+        }
+    }
+
+    #[test]
     fn where_all_poses_are_right_the_probability_is_high_and_finite() {
         let observed: Vec<Observed> =
             drawn(200).into_iter().map(|(o, _)| Observed { right: true, ..o }).collect();
-        let calibration = fit(&observed, &Calibration::embedded().unwrap(), "test".into());
+        let calibration = fit(&observed, &Calibration::embedded().unwrap(), "test".into()).unwrap();
         let p = calibration.probability(&observed[0].evidence);
         assert!(p > 0.9 && p <= 1.0, "{p}");
     }

@@ -33,9 +33,9 @@ pub struct Counts {
     pub right: usize,
     /// Of those, how many were not called registered.
     pub right_refused: usize,
-    /// Wrong poses that were called registered, and those of them said to be all but certain.
+    /// Wrong poses that were called registered.
     pub wrong_trusted: usize,
-    /// As above, with a probability of [`SURE`] or more.
+    /// Wrong poses with a probability of [`SURE`] or more.
     pub wrong_sure: usize,
 }
 
@@ -48,8 +48,8 @@ pub struct Reliability {
     pub by_kind: BTreeMap<Kind, Counts>,
     /// Mean distance of what was said from what was true, over [`BINS`] bins, by their counts (Naeini et al., 2015).
     pub expected_calibration_error: f64,
-    /// Probability that a right pose has the higher probability than a wrong one; NaN where there are not both.
-    pub area_under_roc: f64,
+    /// Probability that a right pose has the higher probability than a wrong one; none where there are not both.
+    pub area_under_roc: Option<f64>,
     /// Lowest probabilities first.
     pub bins: Vec<Bin>,
 }
@@ -98,7 +98,7 @@ impl Reliability {
 }
 
 /// By ranks (Mann and Whitney, 1947); ties count half.
-fn area_under_roc(observed: &[Observed]) -> f64 {
+fn area_under_roc(observed: &[Observed]) -> Option<f64> {
     let mut ranked: Vec<(f64, bool)> = observed.iter().map(|o| (o.probability, o.right)).collect();
     ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
     let right = ranked.iter().filter(|(_, right)| *right).count();
@@ -110,7 +110,7 @@ fn area_under_roc(observed: &[Observed]) -> f64 {
         won += right_here as f64 * (wrong_below as f64 + 0.5 * wrong_here as f64);
         wrong_below += wrong_here;
     }
-    won / (right as f64 * wrong as f64)
+    (right > 0 && wrong > 0).then(|| won / (right as f64 * wrong as f64))
 }
 
 #[cfg(test)]
@@ -126,13 +126,15 @@ mod tests {
 
     #[test]
     fn what_is_said_is_held_against_what_is_true() {
-        // Eight of ten said to be right with 0.8 are, and none of ten said with 0.1.
+        // Eight of ten said to be right with 0.85 are, and none of ten said with 0.1.
         let mut observed: Vec<Observed> = (0..10).map(|i| said(0.85, i < 8)).collect();
         observed.extend((0..10).map(|_| said(0.1, false)));
         let found = Reliability::of(&observed);
         assert!((found.expected_calibration_error - (0.5 * 0.05 + 0.5 * 0.1)).abs() < 1e-12);
         // 8 right ones beat the 10 low ones and tie with the 2 high ones.
-        assert!((found.area_under_roc - (8.0 * 10.0 + 8.0 * 2.0 * 0.5) / (8.0 * 12.0)).abs() < 1e-12);
+        assert!(
+            (found.area_under_roc.unwrap() - (8.0 * 10.0 + 8.0 * 2.0 * 0.5) / (8.0 * 12.0)).abs() < 1e-12
+        );
         let counts = Counts { pairs: 20, right: 8, right_refused: 0, wrong_trusted: 2, wrong_sure: 0 };
         assert_eq!(found.counts, counts);
         assert_eq!(found.by_kind[&Kind::Noisy], counts);
@@ -143,6 +145,6 @@ mod tests {
     fn certainty_falls_into_the_last_bin() {
         let found = Reliability::of(&[said(1.0, true), said(0.0, false)]);
         assert_eq!((found.bins[BINS - 1].count, found.bins[0].count), (1, 1));
-        assert_eq!((found.expected_calibration_error, found.area_under_roc), (0.0, 1.0));
+        assert_eq!((found.expected_calibration_error, found.area_under_roc), (0.0, Some(1.0)));
     }
 }

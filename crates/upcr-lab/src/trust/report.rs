@@ -28,6 +28,11 @@ fn word(choice: &impl Serialize) -> String {
     value.as_ref().and_then(|value| value.as_str()).unwrap_or("all").replace('_', " ")
 }
 
+/// A number where there is one.
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or_else(|| "–".into(), |v| format!("{v:.digits$}"))
+}
+
 /// The tables, in Markdown.
 pub fn markdown(trust: &Trust) -> String {
     let mut text = String::from("## Probability\n\n");
@@ -39,10 +44,10 @@ pub fn markdown(trust: &Trust) -> String {
     );
     for (name, found) in &trust.reliability {
         let Counts { pairs, right, right_refused, wrong_trusted, wrong_sure } = found.counts;
-        let (error, area) = (found.expected_calibration_error, found.area_under_roc);
+        let (error, area) = (found.expected_calibration_error, number(found.area_under_roc, 4));
         let _ = writeln!(
             text,
-            "| {name} | {pairs} | {right} | {error:.4} | {area:.4} | {right_refused} | {wrong_trusted} | {wrong_sure} |"
+            "| {name} | {pairs} | {right} | {error:.4} | {area} | {right_refused} | {wrong_trusted} | {wrong_sure} |"
         );
     }
     text.push_str("\n## By kind of pair\n\n");
@@ -81,12 +86,8 @@ pub fn markdown(trust: &Trust) -> String {
              |---|---:|---:|---:|---:|---:|\n",
         );
         for Coverage { kind, pairs, right, covered, share, mean_nees } in &trust.covariance {
-            let share = 100.0 * share;
-            let _ = writeln!(
-                text,
-                "| {} | {pairs} | {right} | {covered} | {share:.1} % | {mean_nees:.2} |",
-                word(kind)
-            );
+            let (share, nees) = (number(share.map(|s| 100.0 * s), 1), number(*mean_nees, 2));
+            let _ = writeln!(text, "| {} | {pairs} | {right} | {covered} | {share} % | {nees} |", word(kind));
         }
     }
     if !trust.free_axes.is_empty() {

@@ -34,6 +34,9 @@ pub const FEATURES: [&str; 18] = [
     "not_converged",
 ];
 
+/// Largest weight, in amount: sums of such stay finite.
+const LARGEST: f64 = 1e6;
+
 impl Evidence {
     /// The numbers that [`FEATURES`] names; ratios and counts as logarithms, all within bounds.
     pub fn features(&self) -> [f64; FEATURES.len()] {
@@ -103,8 +106,8 @@ impl Weights {
         if self.of.len() != FEATURES.len() || !FEATURES.iter().all(|name| self.of.contains_key(*name)) {
             return Err(format!("its weights are not those of {}", FEATURES.join(", ")));
         }
-        if !self.intercept.is_finite() || self.of.values().any(|weight| !weight.is_finite()) {
-            return Err("a weight is not finite".into());
+        if !self.of.values().chain([&self.intercept]).all(|weight| weight.abs() <= LARGEST) {
+            return Err(format!("a weight is not within ±{LARGEST}"));
         }
         Ok(())
     }
@@ -144,9 +147,14 @@ impl Calibration {
 
     fn parse(text: &str) -> std::result::Result<Self, String> {
         let found: Self = serde_json::from_str(text).map_err(|error| error.to_string())?;
-        found.samples.check()?;
-        found.averages.check()?;
+        found.check()?;
         Ok(found)
+    }
+
+    /// Refuses what lacks a weight or has none that can be computed with.
+    pub(crate) fn check(&self) -> std::result::Result<(), String> {
+        self.samples.check()?;
+        self.averages.check()
     }
 }
 
@@ -197,7 +205,7 @@ mod tests {
         let broken = [
             whole.replace("\"margin\"", "\"magic\""),
             whole.replace("\"margin\":1.5,", ""),
-            whole.replace("1.5", "1e999"),
+            whole.replace("1.5", "1e300"),
             whole.replace("\"about\"", "\"abort\""),
             whole[..whole.len() / 2].into(),
         ];

@@ -9,6 +9,8 @@ use crate::{prepare::Level, transform::Rigid};
 const BLOCK: usize = 64;
 /// Surfaces this many voxels apart still look as if they were meant to meet.
 const NEAR_VOXELS: f32 = 4.0;
+/// Residuals relative to the cloud's own are told up to this.
+const MOST_RESIDUAL: f64 = 1000.0;
 /// Normals that enclose a smaller angle than this (cosine, 25°) agree.
 const FACING_COSINE: f32 = 0.906;
 
@@ -59,7 +61,7 @@ impl Evidence {
             overlap: [0.0; 2],
             inliers: 0,
             closeness: 0.0,
-            residual_ratio: f64::from(f32::MAX),
+            residual_ratio: MOST_RESIDUAL,
             near_misses: 1.0,
             facing: [0.0; 2],
             runner_up: 0.0,
@@ -166,7 +168,7 @@ pub(crate) fn seen(meetings: [&Meeting; 2], voxel_size: f32, rest: Evidence) -> 
     Evidence {
         overlap: meetings.map(|m| m.share(voxel_size)),
         inliers,
-        residual_ratio: (between + floor) / (own + floor),
+        residual_ratio: ((between + floor) / (own + floor)).min(MOST_RESIDUAL),
         near_misses: 1.0 - share(inliers, near),
         facing: [0, 1].map(|k| share(both(voxel_size).filter(|b| b.facing[k]).count(), inliers)),
         ..rest
