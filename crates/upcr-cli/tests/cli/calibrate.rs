@@ -35,8 +35,11 @@ fn what_is_fitted_is_used_and_told() {
         upcr(words.iter().chain(calibration)).json()
     };
     let (own, default) = (asked(&["--calibration", &out]), asked(&[]));
-    // Samples that are averaged were not seen: there the default holds.
-    assert_eq!(own["probability"], default["probability"]);
+    assert_ne!(own["probability"], default["probability"]);
+    assert_eq!(own["evidence"], default["evidence"]);
+    // Points that are averages were not seen: there the default's weights stay.
+    let library = upcr::Calibration::embedded().unwrap();
+    assert_eq!(calibration["averages"], serde_json::to_value(&library.averages).unwrap());
     assert_eq!(own["settings"]["calibration"], calibration["about"]);
     assert!(default["settings"]["calibration"].is_null());
 }

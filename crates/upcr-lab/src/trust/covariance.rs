@@ -7,7 +7,7 @@ use serde::Serialize;
 use upcr::{CloudRole, Error, PointCloud, Registration, Result, Rigid, Settings, register};
 
 use crate::data::Shapes;
-use crate::data::pairs::{ClippedNoise, Pair, Protocol};
+use crate::data::pairs::{ClippedNoise, POINTS, Pair, Protocol};
 use crate::data::scanner::{Optics, Scene, Sensor, SynthSettings, synth};
 use crate::eval::metrics::Tolerance;
 use crate::random;
@@ -149,13 +149,15 @@ fn pair(kind: Kind, shapes: &Shapes, rng: &mut impl Rng) -> Result<Pair> {
 }
 
 fn pair_of_shape(kind: Kind, shape: &[[f64; 3]], rng: &mut impl Rng) -> Result<Pair> {
+    // A half has to suffice for a cloud.
+    let points = POINTS.min(shape.len() / 2);
     if kind == Kind::SameSamples {
-        return Protocol::CONSISTENT.noisy().random_pair(shape, rng);
+        return Protocol { points, ..Protocol::CONSISTENT.noisy() }.random_pair(shape, rng);
     }
     let noise = Some(ClippedNoise { sigma: rng.random_range(0.005..0.02), ..ClippedNoise::STANDARD });
     let whole_or_part =
         if kind == Kind::Partial { Protocol::PARTIAL_INDEPENDENT } else { Protocol::CONSISTENT };
-    let protocol = Protocol { noise, ..whole_or_part };
+    let protocol = Protocol { noise, points, ..whole_or_part };
     // Two pairs of one motion, of either half of the samples: of the one the source is taken, of the other the target.
     let seed = rng.random();
     let of = |half: &[[f64; 3]]| protocol.random_pair(half, &mut random::stream(seed, 0));
