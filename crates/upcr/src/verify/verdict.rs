@@ -7,6 +7,9 @@ use crate::registration::{Reason, TRUSTWORTHY};
 const FEWEST_INLIERS: usize = 10;
 /// Fewer points than this say little.
 const FEWEST_POINTS: usize = 50;
+/// The calibration was fitted on clouds of no fewer points: of smaller ones no pose is called surer than this.
+const FEWEST_FITTED: usize = 300;
+const UNSURE: f64 = 0.9;
 /// Overlap under which a pose is called a pose of clouds that share nothing, and that share little.
 const NO_OVERLAP: f64 = 0.1;
 const LOW_OVERLAP: f64 = 0.3;
@@ -42,6 +45,9 @@ pub(crate) fn judge(e: &Evidence, calibration: &Calibration) -> Verdict {
         }
     }
     let mut probability = calibration.probability(e);
+    if e.points < FEWEST_FITTED {
+        probability = probability.min(UNSURE);
+    }
     if !reasons.is_empty() {
         let against_the_pose = |r: &Reason| *r != Reason::LowOverlap;
         if reasons.iter().any(against_the_pose) {
@@ -107,6 +113,12 @@ mod tests {
             assert!(verdict.reasons.contains(&reason), "{evidence:?}: {verdict:?}");
             assert!(verdict.probability < verdict_on(&GOOD).probability, "{evidence:?}: {verdict:?}");
         }
+    }
+
+    #[test]
+    fn of_few_points_no_pose_is_sure() {
+        let verdict = verdict_on(&Evidence { points: 299, ..GOOD });
+        assert!(verdict.probability <= UNSURE && verdict.reasons.is_empty(), "{verdict:?}");
     }
 
     #[test]
