@@ -157,7 +157,7 @@ fn pair_of_shape(kind: Kind, shape: &[[f64; 3]], rng: &mut impl Rng) -> Result<P
     let noise = Some(ClippedNoise { sigma: rng.random_range(0.005..0.02), ..ClippedNoise::STANDARD });
     let whole_or_part =
         if kind == Kind::Partial { Protocol::PARTIAL_INDEPENDENT } else { Protocol::CONSISTENT };
-    let protocol = Protocol { noise, points, ..whole_or_part };
+    let protocol = Protocol { points, noise, ..whole_or_part };
     // Two pairs of one motion, of either half of the samples: of the one the source is taken, of the other the target.
     let seed = rng.random();
     let of = |half: &[[f64; 3]]| protocol.random_pair(half, &mut random::stream(seed, 0));
