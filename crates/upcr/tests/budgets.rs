@@ -10,22 +10,13 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use common::Pair;
+use common::consistent::choices::METHODS;
 use nalgebra::Vector3;
 use rand::Rng;
 use upcr::{
     Error, Method, PointCloud, Progress, Reason, Registration, Rigid, Settings, Stage, TRUSTWORTHY, Watch,
     register, register_watched,
 };
-
-const METHODS: [Method; 7] = [
-    Method::Auto,
-    Method::Features,
-    Method::Prior,
-    Method::Upcr,
-    Method::Fgr,
-    Method::Ransac,
-    Method::Consensus,
-];
 
 /// Held by what takes long on all threads: one would wait for the other.
 static ALONE: Mutex<()> = Mutex::new(());

@@ -7,6 +7,7 @@ mod common;
 use std::num::NonZeroUsize;
 
 use common::Pair;
+use common::consistent::choices::METHODS;
 use upcr::{Method, Settings, register};
 
 /// The answer as JSON, without what may differ: the times and the number of threads asked for.
@@ -23,15 +24,7 @@ fn answer(pair: &Pair, method: Method, threads: usize) -> String {
 #[test]
 fn threads_and_runs_do_not_matter() {
     let pair = Pair::sample(2);
-    for method in [
-        Method::Auto,
-        Method::Features,
-        Method::Prior,
-        Method::Upcr,
-        Method::Fgr,
-        Method::Ransac,
-        Method::Consensus,
-    ] {
+    for method in METHODS {
         let first = answer(&pair, method, 1);
         for threads in [1, 2, 3, 2] {
             assert_eq!(answer(&pair, method, threads), first, "{method:?} on {threads} threads");
