@@ -5,13 +5,17 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 
 use ::laz::laszip::{ChunkTable, CompressorType};
 use ::laz::record::{LayeredPointRecordDecompressor, RecordDecompressor, SequentialPointRecordDecompressor};
-use ::laz::{LazItem, LazItemRecordBuilder, LazItemType, LazVlr, LazVlrBuilder, ParLasZipCompressor};
+use ::laz::{
+    DecompressionSelection, LazItem, LazItemRecordBuilder, LazItemType, LazVlr, LazVlrBuilder,
+    ParLasZipCompressor,
+};
 use rayon::prelude::*;
 
 use crate::PointCloud;
 
 use super::super::input::{Fallible, Fault, Input, check_expansion, malformed, unsupported};
 use super::super::output::Output;
+use super::gps_time;
 use super::header::{self, Header, RECORD_HEADER, padded};
 use super::{Points, for_each_batch};
 
@@ -121,22 +125,23 @@ fn decode(chunk: Chunk, header: &Header, items: &[LazItem]) -> Fallible<Points> 
     if layered {
         check_layers(&chunk, header, items)?;
     }
+    let bytes = Cursor::new(chunk.bytes);
     // The decoder takes the bytes for what a coder wrote, and may overrun its tables where they are not.
     catch_unwind(AssertUnwindSafe(|| {
         if layered {
-            decode_with(
-                LayeredPointRecordDecompressor::new(Cursor::new(chunk.bytes)),
-                chunk.count,
-                header,
-                items,
-            )
+            let mut decoder = LayeredPointRecordDecompressor::new(bytes);
+            decoder.set_fields_from(&items.to_vec())?;
+            decoder.set_selection(DecompressionSelection::base().decompress_z().decompress_rgb());
+            decode_with(decoder, chunk.count, header)
         } else {
-            decode_with(
-                SequentialPointRecordDecompressor::new(Cursor::new(chunk.bytes)),
-                chunk.count,
-                header,
-                items,
-            )
+            let mut decoder = SequentialPointRecordDecompressor::new(bytes);
+            for item in items {
+                match (item.item_type(), item.version()) {
+                    (LazItemType::GpsTime, 2) => decoder.add_field_decompressor(gps_time::Skipped::default()),
+                    _ => decoder.set_fields_from(&vec![*item])?,
+                }
+            }
+            decode_with(decoder, chunk.count, header)
         }
     }))
     .unwrap_or_else(|_| malformed("the compressed points are corrupt"))
@@ -146,9 +151,7 @@ fn decode_with(
     mut decoder: impl RecordDecompressor<Cursor<Vec<u8>>>,
     count: u64,
     header: &Header,
-    items: &[LazItem],
 ) -> Fallible<Points> {
-    decoder.set_fields_from(&items.to_vec())?;
     // Grows with what is really there, whatever the count claims.
     let mut points = Points::default();
     let mut record = vec![0; usize::from(header.record_length)];

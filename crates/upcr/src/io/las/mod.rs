@@ -1,5 +1,6 @@
 //! LAS 1.0 to 1.4, and LAZ, its compressed form.
 
+mod gps_time;
 mod header;
 mod laz;
 
