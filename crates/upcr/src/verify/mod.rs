@@ -12,5 +12,5 @@ pub(crate) use conditioning::Uncertainty;
 pub use evidence::Evidence;
 pub(crate) use evidence::{meeting, seen};
 pub(crate) use overlap::overlap_at;
-pub(crate) use scale::{Sizes, scaled};
+pub(crate) use scale::Sizes;
 pub(crate) use verdict::judge;

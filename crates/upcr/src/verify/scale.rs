@@ -2,7 +2,10 @@
 
 use nalgebra::Vector3;
 
-use crate::{PointCloud, cloud::deviations, hypothesis::ALIKE};
+use crate::{
+    PointCloud, Registration, Result, Settings, cloud::deviations, hypothesis::ALIKE, refine::Locks,
+    settings::Method, watch::Call,
+};
 
 /// Lengths of common units: millimetre, centimetre, inch, foot, metre, kilometre.
 const UNITS_M: [f64; 6] = [0.001, 0.01, 0.0254, 0.3048, 1.0, 1000.0];
@@ -37,7 +40,7 @@ impl Sizes {
 
     /// Factors that might make the source fit, likely ones first: that between two views of one whole, and that between
     /// two units.
-    pub fn factors(&self) -> Vec<f64> {
+    fn factors(&self) -> Vec<f64> {
         let ratio = self.ratio();
         let mut factors = Vec::new();
         if !(ratio.is_finite() && ratio > 0.0) {
@@ -55,10 +58,43 @@ impl Sizes {
         );
         factors
     }
+
+    /// The factor that makes the source fit, as `register` finds, where its own size does not.
+    pub fn fitting_factor(
+        &self,
+        source: &PointCloud,
+        target: &PointCloud,
+        settings: &Settings,
+        call: &Call,
+        register: impl Fn(&PointCloud, &PointCloud, &Settings, &Call) -> Result<Registration>,
+    ) -> Option<f64> {
+        let factors = self.factors();
+        if factors.is_empty() {
+            return None;
+        }
+        // A guess at the wrong scale is none at the right one.
+        let method = if settings.method == Method::Prior { Method::Auto } else { settings.method };
+        let plain =
+            Settings { method, init: None, locks: Locks::default(), voxel_size: None, ..settings.clone() };
+        let target = scaled(target, 1.0);
+        for factor in factors {
+            let aside = call.aside();
+            let fits = register(&scaled(source, factor), &target, &plain, &aside);
+            if aside.ended_by().is_some() {
+                // What ends the question ends the call, which finds that out by asking.
+                call.is_over();
+                return None;
+            }
+            if fits.is_ok_and(|fits| fits.is_trustworthy()) {
+                return Some(factor);
+            }
+        }
+        None
+    }
 }
 
 /// The cloud with all lengths times `factor`, in so many points as the question needs.
-pub(crate) fn scaled(cloud: &PointCloud, factor: f64) -> PointCloud {
+fn scaled(cloud: &PointCloud, factor: f64) -> PointCloud {
     const POINTS: usize = 50_000;
     let step = cloud.len().div_ceil(POINTS).max(1);
     PointCloud::from_points(cloud.points.iter().step_by(step).map(|p| p.map(|v| v * factor)).collect())
