@@ -15,10 +15,10 @@ use crate::random;
 /// 95 % of χ² of six degrees of freedom.
 const CHI_SQUARE_95: f64 = 12.592;
 
-/// How a pair comes about.
+/// Kinds of noisy pairs, by how they come about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Kind {
+pub enum NoisyPair {
     /// Both clouds are the same samples of a shape, with noise of their own (σ 0.01 of the radius).
     SameSamples,
     /// Each cloud has its own samples, and noise of σ 0.005 to 0.02.
@@ -34,24 +34,24 @@ pub enum Kind {
 }
 
 /// Kinds in the order in which pairs take turns.
-const TURNS: [Kind; 10] = [
-    Kind::SameSamples,
-    Kind::OtherSamples,
-    Kind::Partial,
-    Kind::Object,
-    Kind::Room,
-    Kind::SameSamples,
-    Kind::OtherSamples,
-    Kind::Partial,
-    Kind::Object,
-    Kind::Street,
+const TURNS: [NoisyPair; 10] = [
+    NoisyPair::SameSamples,
+    NoisyPair::OtherSamples,
+    NoisyPair::Partial,
+    NoisyPair::Object,
+    NoisyPair::Room,
+    NoisyPair::SameSamples,
+    NoisyPair::OtherSamples,
+    NoisyPair::Partial,
+    NoisyPair::Object,
+    NoisyPair::Street,
 ];
 
-/// Coverage over the pairs of one kind, or over all.
+/// Coverage over the noisy pairs of one kind, or over all.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Coverage {
     /// The kind; none for all.
-    pub kind: Option<Kind>,
+    pub kind: Option<NoisyPair>,
     /// Pairs made.
     pub pairs: usize,
     /// Of these, the ones with a pose within 5° and a tenth of the source's extent: the others are wrong, not uncertain.
@@ -69,16 +69,22 @@ pub struct Coverage {
 /// # Errors
 /// Where shapes have too few points, or as [`register`] says.
 pub fn measure(shapes: &Shapes, pairs: usize, seed: u64, settings: &Settings) -> Result<Vec<Coverage>> {
-    let outcome = |index: usize| -> Result<(Kind, Option<f64>)> {
+    let outcome = |index: usize| -> Result<(NoisyPair, Option<f64>)> {
         let kind = TURNS[index % TURNS.len()];
         let pair = pair(kind, shapes, &mut random::stream(seed, index as u64))?;
         let found = register(&pair.source, &pair.target, settings)?;
         Ok((kind, nees_where_right(&pair, &found)?))
     };
     let outcomes = (0..pairs).into_par_iter().map(outcome).collect::<Result<Vec<_>>>()?;
-    let kinds =
-        [Kind::SameSamples, Kind::OtherSamples, Kind::Partial, Kind::Object, Kind::Room, Kind::Street];
-    let of = |kind: Option<Kind>| {
+    let kinds = [
+        NoisyPair::SameSamples,
+        NoisyPair::OtherSamples,
+        NoisyPair::Partial,
+        NoisyPair::Object,
+        NoisyPair::Room,
+        NoisyPair::Street,
+    ];
+    let of = |kind: Option<NoisyPair>| {
         let chosen = outcomes.iter().filter(|(k, _)| kind.is_none_or(|kind| kind == *k));
         Coverage::of(kind, &chosen.map(|(_, nees)| *nees).collect::<Vec<_>>())
     };
@@ -86,7 +92,7 @@ pub fn measure(shapes: &Shapes, pairs: usize, seed: u64, settings: &Settings) ->
 }
 
 impl Coverage {
-    fn of(kind: Option<Kind>, outcomes: &[Option<f64>]) -> Self {
+    fn of(kind: Option<NoisyPair>, outcomes: &[Option<f64>]) -> Self {
         let right: Vec<f64> = outcomes.iter().copied().flatten().collect();
         let covered = right.iter().filter(|nees| **nees <= CHI_SQUARE_95).count();
         let share = |of: f64| (!right.is_empty()).then(|| of / right.len() as f64);
@@ -124,12 +130,12 @@ fn nees_where_right(pair: &Pair, found: &Registration) -> Result<Option<f64>> {
 }
 
 /// A pair of some kind.
-fn pair(kind: Kind, shapes: &Shapes, rng: &mut impl Rng) -> Result<Pair> {
+fn pair(kind: NoisyPair, shapes: &Shapes, rng: &mut impl Rng) -> Result<Pair> {
     let scene = match kind {
-        Kind::Object => Scene::Object,
-        Kind::Room => Scene::Room,
-        Kind::Street => Scene::Street,
-        Kind::SameSamples | Kind::OtherSamples | Kind::Partial => {
+        NoisyPair::Object => Scene::Object,
+        NoisyPair::Room => Scene::Room,
+        NoisyPair::Street => Scene::Street,
+        NoisyPair::SameSamples | NoisyPair::OtherSamples | NoisyPair::Partial => {
             let shape = shapes.points(rng.random_range(0..shapes.len()));
             return pair_of_shape(kind, &shape, rng);
         }
@@ -148,15 +154,15 @@ fn pair(kind: Kind, shapes: &Shapes, rng: &mut impl Rng) -> Result<Pair> {
     })
 }
 
-fn pair_of_shape(kind: Kind, shape: &[[f64; 3]], rng: &mut impl Rng) -> Result<Pair> {
+fn pair_of_shape(kind: NoisyPair, shape: &[[f64; 3]], rng: &mut impl Rng) -> Result<Pair> {
     // A half has to suffice for a cloud.
     let points = POINTS.min(shape.len() / 2);
-    if kind == Kind::SameSamples {
+    if kind == NoisyPair::SameSamples {
         return Protocol { points, ..Protocol::CONSISTENT.noisy() }.random_pair(shape, rng);
     }
     let noise = Some(ClippedNoise { sigma: rng.random_range(0.005..0.02), ..ClippedNoise::STANDARD });
     let whole_or_part =
-        if kind == Kind::Partial { Protocol::PARTIAL_INDEPENDENT } else { Protocol::CONSISTENT };
+        if kind == NoisyPair::Partial { Protocol::PARTIAL_INDEPENDENT } else { Protocol::CONSISTENT };
     let protocol = Protocol { points, noise, ..whole_or_part };
     // Two pairs of one motion, of either half of the samples: of the one the source is taken, of the other the target.
     let seed = rng.random();
