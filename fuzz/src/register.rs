@@ -32,8 +32,8 @@ pub fn register(data: &[u8]) {
 impl<'a> Arbitrary<'a> for Task {
     fn arbitrary(u: &mut Unstructured<'a>) -> Result<Self> {
         let settings = settings(u)?;
-        let source = cloud(u)?;
-        let target = match u.int_in_range(0..=3)? {
+        let mut source = cloud(u)?;
+        let mut target = match u.int_in_range(0..=3)? {
             0 => cloud(u)?,
             1 => source.clone(),
             2 => source.transformed(&pose(u)?),
@@ -47,6 +47,13 @@ impl<'a> Arbitrary<'a> for Task {
                 target
             }
         };
+        for cloud in [&mut source, &mut target] {
+            cloud.viewpoint = match u.int_in_range(0..=3)? {
+                0 | 1 => None,
+                2 => Some([f64::from(u.arbitrary::<i8>()?), 0.0, power(u)?]),
+                _ => Some(u.arbitrary()?),
+            };
+        }
         Ok(Self { source, target, settings })
     }
 }

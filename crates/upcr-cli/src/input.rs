@@ -1,5 +1,6 @@
 //! The options of reading a cloud, shared by the commands.
 
+use std::num::ParseFloatError;
 use std::path::Path;
 
 use anyhow::bail;
@@ -8,7 +9,7 @@ use upcr::io::{self, Intrinsics, ReadOptions};
 use upcr::{Error, PointCloud};
 
 #[derive(clap::Args)]
-#[command(next_help_heading = "Reading meshes and depth images")]
+#[command(next_help_heading = "Reading files")]
 pub struct Reading {
     /// Points to sample from a mesh
     #[arg(long, value_name = "N", default_value_t = ReadOptions::default().mesh_samples)]
@@ -22,7 +23,15 @@ pub struct Reading {
     /// Depth image units per metre
     #[arg(long, value_name = "N", default_value_t = ReadOptions::default().depth_scale)]
     depth_scale: f64,
+    /// Where the sensor stood when it took a scan, in the file's frame and unit, if the file does not say: 0,0,0 for scans
+    /// in their sensor's frame. For clouds that are one scan each, seen from one place
+    #[arg(long, value_name = "X,Y,Z", value_parser = viewpoint, allow_hyphen_values = true)]
+    viewpoint: Option<Viewpoint>,
 }
+
+/// A place in a cloud's frame.
+#[derive(Clone, Copy)]
+struct Viewpoint([f64; 3]);
 
 impl Reading {
     /// Reads the cloud at `path`.
@@ -32,6 +41,7 @@ impl Reading {
             seed: self.mesh_seed,
             intrinsics: self.intrinsics,
             depth_scale: self.depth_scale,
+            viewpoint: self.viewpoint.map(|Viewpoint(place)| place),
         };
         io::read_cloud_with(path, &options)
     }
@@ -54,7 +64,18 @@ pub fn name_file(error: Error, source: &Path, target: &Path) -> anyhow::Error {
 }
 
 fn intrinsics(text: &str) -> anyhow::Result<Intrinsics> {
-    let values = text.split(',').map(|v| v.trim().parse()).collect::<Result<Vec<f64>, _>>()?;
-    let [fx, fy, cx, cy] = values[..] else { bail!("four numbers are needed") };
+    let [fx, fy, cx, cy] = numbers(text)?[..] else { bail!("four numbers are needed") };
     Ok(Intrinsics { fx, fy, cx, cy })
+}
+
+fn viewpoint(text: &str) -> anyhow::Result<Viewpoint> {
+    let [x, y, z] = numbers(text)?[..] else { bail!("three numbers are needed") };
+    if ![x, y, z].iter().all(|v| v.is_finite()) {
+        bail!("the place is not finite");
+    }
+    Ok(Viewpoint([x, y, z]))
+}
+
+fn numbers(text: &str) -> Result<Vec<f64>, ParseFloatError> {
+    text.split(',').map(|v| v.trim().parse()).collect()
 }

@@ -101,6 +101,8 @@ pub(crate) struct Level {
 pub(crate) struct Prepared {
     /// Local coordinates are the file's minus this.
     pub origin: [f64; 3],
+    /// Where the sensor stood, about the local origin, where that is known.
+    pub viewpoint: Option<[f32; 3]>,
     /// Length of the bounding box's diagonal.
     pub diagonal: f32,
     /// Points of the cloud that were looked at.
@@ -261,6 +263,8 @@ pub(crate) fn prepare(
     }
     let go_on = || call.go_on();
     let origin = bounds.center();
+    let viewpoint = checked.cloud.viewpoint.map(|v| local(v, origin));
+    let viewpoint = viewpoint.filter(|v| v.iter().all(|c| c.is_finite()));
     let diagonal = bounds.diagonal() as f32;
     let corner = std::array::from_fn(|k| bounds.min[k] - origin[k]);
     let grid = VoxelGrid::new(checked.points(), origin, corner, voxel_size, most, go_on)?;
@@ -268,7 +272,7 @@ pub(crate) fn prepare(
     if points_used <= FEATURE_POINTS && grid.cells.len() * 10 >= points_used * 4 {
         // The scale is the cloud's own spacing: keep the samples themselves.
         let fine = Level::sparse(checked.local_points(), voxel_size, described, call)?;
-        return Ok(Prepared { origin, diagonal, points_used, fine, coarse: None });
+        return Ok(Prepared { origin, viewpoint, diagonal, points_used, fine, coarse: None });
     }
     let separate = described != Described::Never && grid.cells.len() > FEATURE_POINTS;
     let fine_described = if separate { Described::Never } else { described };
@@ -282,7 +286,7 @@ pub(crate) fn prepare(
         }
         coarse = Some(Level::from_grid(&grid, size, described, call)?);
     }
-    Ok(Prepared { origin, diagonal, points_used, fine, coarse })
+    Ok(Prepared { origin, viewpoint, diagonal, points_used, fine, coarse })
 }
 
 impl Level {

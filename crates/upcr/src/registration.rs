@@ -20,6 +20,8 @@ pub enum Reason {
     LowOverlap,
     /// Another, different pose explains the clouds nearly as well.
     Ambiguous,
+    /// Points of one cloud stand where the other's sensor saw through to something behind.
+    SeenThrough,
     /// Some motion is not held by the geometry: those in [`Registration::free_directions`].
     DegenerateAxis,
     /// Too few points to tell.
@@ -42,6 +44,9 @@ impl std::fmt::Display for Reason {
             Self::NoOverlap => "the clouds share no surface at the pose found",
             Self::LowOverlap => "the clouds share little surface at the pose found",
             Self::Ambiguous => "another, different pose explains the clouds nearly as well",
+            Self::SeenThrough => {
+                "points of one cloud stand where the other's sensor saw through to something behind"
+            }
             Self::DegenerateAxis => "some direction of motion is not held by the geometry",
             Self::TooFewPoints => "there are too few points to tell",
             Self::ScaleMismatch => {

@@ -258,6 +258,15 @@ impl Case {
             }
         }
         let settings = Settings { method, refine, ..settings(scale, &truth, &mut rng) };
+        for cloud in [&mut source, &mut target] {
+            let odd = [f64::NAN, f64::INFINITY, f64::MAX, 0.0, 1e-3 * scale, 1e3 * scale];
+            cloud.viewpoint = match rng.random_range(0..6) {
+                0 => Some([0; 3].map(|_| scale * normal(&mut rng))),
+                1 => Some([0; 3].map(|_| odd[rng.random_range(0..odd.len())])),
+                2 => cloud.points.first().copied(),
+                _ => None,
+            };
+        }
         let known = !lost && !matches!(relation, Relation::Other | Relation::Mirrored);
         let case = format!(
             "{seed}: {shape:?} {relation:?} of {count} points, scale {scale:e}, {method:?} {refine:?}"

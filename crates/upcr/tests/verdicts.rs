@@ -6,7 +6,7 @@ mod common;
 
 use common::{Pair, rotation, seeded};
 use rand::Rng;
-use upcr::{PointCloud, Reason, Registration, Settings, register};
+use upcr::{Method, PointCloud, Reason, Refinement, Registration, Settings, register};
 
 /// Points on a square table of 1 × 1 × 0.7: its top and four legs, with a little noise.
 fn square_table(seed: u64) -> PointCloud {
@@ -89,4 +89,40 @@ fn every_reason_comes_with_a_sentence_and_a_code() {
     assert!(found.reasons.iter().all(|reason| reason.to_string().split(' ').count() > 4));
     assert_eq!(json["alternatives"].as_array().unwrap().len(), found.alternatives.len());
     assert!(json["evidence"]["rivals"].as_u64().unwrap() >= 1);
+}
+
+/// The floor before a wall across the view, `depth` ahead of a sensor that stands at the origin, 1.5 above the floor.
+fn wall_ahead(depth: f64, seed: u64) -> PointCloud {
+    let mut rng = seeded(seed);
+    let mut point = || {
+        let mut within = |a: f64, b: f64| rng.random_range(a..b);
+        let noise = within(-0.005, 0.005);
+        let (across, up) = (within(-0.6, 0.6), within(-0.45, 0.45));
+        let floor = if up < 0.0 { 1.5 / -up } else { f64::INFINITY };
+        let range = depth.min(floor) + noise;
+        [across * range, up * range, range]
+    };
+    PointCloud::from_points((0..20_000).map(|_| point()).collect())
+}
+
+#[test]
+fn a_wall_where_the_other_sensor_saw_through_is_told() {
+    let (near, far) = (wall_ahead(4.0, 1), wall_ahead(7.0, 2));
+    // Floor on floor, as whoever has no better guess may ask.
+    let settings = Settings { method: Method::Prior, refine: Refinement::None, ..Settings::default() };
+    let judged = |eye: Option<[f64; 3]>| {
+        let far = PointCloud { viewpoint: eye, ..far.clone() };
+        register(&near, &far, &settings).unwrap()
+    };
+    let (blind, seeing) = (judged(None), judged(Some([0.0; 3])));
+    assert_eq!(blind.evidence.in_free_space, None);
+    assert!(!blind.reasons.contains(&Reason::SeenThrough), "{:?}", blind.reasons);
+    assert!(seeing.evidence.in_free_space.unwrap() > 0.3, "{:?}", seeing.evidence);
+    assert!(seeing.reasons.contains(&Reason::SeenThrough), "{:?}", seeing.reasons);
+    assert!(!seeing.is_trustworthy() && seeing.probability <= blind.probability);
+
+    // Another scan of the same wall from the same place leaves the way free.
+    let again = PointCloud { viewpoint: Some([0.0; 3]), ..wall_ahead(7.0, 3) };
+    let found = register(&again, &PointCloud { viewpoint: Some([0.0; 3]), ..far }, &settings).unwrap();
+    assert_eq!(found.evidence.in_free_space, Some(0.0));
 }

@@ -53,6 +53,21 @@ fn json_is_one_complete_object() {
 }
 
 #[test]
+fn told_where_the_sensors_stood_it_looks_for_free_space() {
+    let share = |more: &[&str]| {
+        let (source, target) = (sample("source.ply"), sample("target.ply"));
+        let args = ["register", &source, &target, "--json"];
+        upcr(args.iter().chain(more)).json()["evidence"]["in_free_space"].clone()
+    };
+    assert!(share(&[]).is_null());
+    assert!(share(&["--viewpoint", "-1,0.5,2e1"]).is_f64());
+    let run = |place: &str| upcr(["info", &sample("source.ply"), "--viewpoint", place]);
+    assert!(run("1,2,3").stdout.contains("viewpoint"));
+    assert_eq!(run("1,2").status, 2);
+    assert_eq!(run("1,2,inf").status, 2);
+}
+
+#[test]
 fn the_summary_says_what_the_json_says() {
     let run = upcr(["register", &sample("source.ply"), &sample("target.ply")]);
     assert_eq!(run.status, 0, "{}", run.stderr);

@@ -359,11 +359,16 @@ fn scan_case([source, target]: [PointCloud; 2], T: Rigid, tolerance: Tolerance, 
     let turn = Rigid { rotation: random::rotation(rng), translation: Vector3::zeros() };
     Case {
         kind,
-        source: moved(&source.points, &turn),
-        target: PointCloud::from_points(target.points),
+        source: bare(source).transformed(&turn),
+        target: bare(target),
         T_target_source: Some(T * turn.inverse()),
         tolerance,
     }
+}
+
+/// Points, and from where they were seen.
+fn bare(cloud: PointCloud) -> PointCloud {
+    PointCloud { viewpoint: cloud.viewpoint, ..PointCloud::from_points(cloud.points) }
 }
 
 /// Standard deviations along the axes, times the square root of twelve: the sides of a box so spread.
@@ -409,12 +414,31 @@ fn place_case(places: &[Place], rng: &mut impl Rng) -> Result<Case> {
     if !others.is_empty() && rng.random_bool(0.33) {
         let other = others[rng.random_range(0..others.len())];
         let second = &other.scans[rng.random_range(0..other.scans.len())];
-        let clouds = [warped(&a.0, place.warp, rng), warped(&second.0, place.warp, rng)];
+        let clouds = worn(place, [&a.0, &second.0], rng);
         let case = scan_case(clouds, Rigid::identity(), tolerance, rng);
         return Ok(Case { kind: Kind::Different, T_target_source: None, ..case });
     }
     let T = b.1.inverse() * a.1;
-    Ok(scan_case([warped(&a.0, place.warp, rng), warped(&b.0, place.warp, rng)], T, tolerance, rng))
+    Ok(scan_case(worn(place, [&a.0, &b.0], rng), T, tolerance, rng))
+}
+
+/// The scans as a worn-out sensor gives them, and as programs pass them on: of some it is not said from where they were
+/// seen, and of others not exactly.
+fn worn(place: &Place, scans: [&PointCloud; 2], rng: &mut impl Rng) -> [PointCloud; 2] {
+    const SAID: f64 = 0.6;
+    const SAID_OF_ONE: f64 = 0.8;
+    const OFF: f64 = 0.05;
+    if place.warp == 0.0 {
+        return scans.map(Clone::clone);
+    }
+    let said = rng.random_bool(SAID);
+    scans.map(|scan| {
+        let cloud = warped(scan, place.warp, rng);
+        let off = rng.random_range(0.0..OFF) * diameter(&thinned(&scan.points, 1000));
+        let off = random::direction(rng) * off;
+        let viewpoint = cloud.viewpoint.filter(|_| said && rng.random_bool(SAID_OF_ONE));
+        PointCloud { viewpoint: viewpoint.map(|v| (Vector3::from(v) + off).into()), ..cloud }
+    })
 }
 
 /// The scan, about its sensor, with errors of its ranges that are alike in neighbouring directions.
@@ -437,7 +461,7 @@ fn warped(scan: &PointCloud, warp: f64, rng: &mut impl Rng) -> PointCloud {
         let error: f64 = waves.iter().map(|(wave, phase)| (wave.dot(&direction) + phase).sin()).sum();
         (p * (1.0 + amplitude * error)).into()
     };
-    PointCloud::from_points(scan.points.iter().map(point).collect())
+    PointCloud { points: scan.points.iter().map(point).collect(), ..scan.clone() }
 }
 
 /// A made-up scene, scanned from places that see more or less of the same.
@@ -470,7 +494,7 @@ fn virtual_place(rng: &mut impl Rng) -> Result<Place> {
     let resized = |scan: Scan| {
         let points = scan.cloud.points.iter().map(|p| p.map(|v| size * v)).collect();
         let pose = Rigid { translation: scan.T_world_sensor.translation * size, ..scan.T_world_sensor };
-        (PointCloud::from_points(points), pose)
+        (PointCloud { points, ..scan.cloud }, pose)
     };
     let scans = synth(&settings)?.into_iter().map(resized).collect();
     Ok(Place { scans, tolerance, warp })

@@ -8,8 +8,9 @@ use super::observe::Observed;
 const COUNT: usize = FEATURES.len();
 /// Which way each of [`FEATURES`] speaks: for the pose (1), against it (-1), or either way (0). Evidence that among the
 /// training pairs seems to speak the other way does so by way of other evidence, and gets no weight of its own.
-const SPEAKS: [f64; COUNT] =
-    [1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, -1.0, -1.0];
+const SPEAKS: [f64; COUNT] = [
+    1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, 0.0, 1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, -1.0, -1.0,
+];
 /// Ridge on the weights of standardised features: keeps them finite where a feature tells right from wrong alone.
 const RIDGE: f64 = 0.1;
 /// Pairs without which nothing is fitted.

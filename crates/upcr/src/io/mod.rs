@@ -102,11 +102,13 @@ pub struct ReadOptions {
     pub intrinsics: Option<Intrinsics>,
     /// Depth image units per metre.
     pub depth_scale: f64,
+    /// Where the sensor stood, in the file's frame, where the file itself does not say.
+    pub viewpoint: Option<[f64; 3]>,
 }
 
 impl Default for ReadOptions {
     fn default() -> Self {
-        Self { mesh_samples: 100_000, seed: 0, intrinsics: None, depth_scale: 1000.0 }
+        Self { mesh_samples: 100_000, seed: 0, intrinsics: None, depth_scale: 1000.0, viewpoint: None }
     }
 }
 
@@ -255,16 +257,18 @@ pub fn extensions() -> impl Iterator<Item = (&'static str, bool)> {
 }
 
 fn cloud_of(format: &Format, input: &mut Input, options: &ReadOptions) -> Fallible<PointCloud> {
-    match format.read {
-        Reader::Cloud(read) | Reader::CloudOrMesh(read, _) => read(input, options),
+    let cloud = match format.read {
+        Reader::Cloud(read) | Reader::CloudOrMesh(read, _) => read(input, options)?,
         Reader::Mesh(read) => {
             let mesh = read(input)?;
             if mesh.triangles.is_empty() {
-                return Ok(PointCloud::from_points(mesh.vertices));
+                PointCloud::from_points(mesh.vertices)
+            } else {
+                mesh.sample(options.mesh_samples, options.seed)
             }
-            Ok(mesh.sample(options.mesh_samples, options.seed))
         }
-    }
+    };
+    Ok(PointCloud { viewpoint: cloud.viewpoint.or(options.viewpoint), ..cloud })
 }
 
 fn mesh_of(format: &Format, input: &mut Input) -> Fallible<TriangleMesh> {

@@ -538,9 +538,13 @@ fn e57_poses_are_applied() {
     assert_eq!(cloud.viewpoint, Some([10.0, 0.0, 1.0]));
     assert_eq!(cloud.len(), 1, "the invalid point is dropped");
     assert!(largest_difference(&cloud, &PointCloud::from_points(vec![[10.0, 1.0, 1.0]])) < 1e-12);
+    let elsewhere = ReadOptions { viewpoint: Some([1.0, 2.0, 3.0]), ..ReadOptions::default() };
+    let viewpoint = |options: &ReadOptions| read_cloud_with(&path, options).unwrap().viewpoint;
+    assert_eq!(viewpoint(&elsewhere), Some([10.0, 0.0, 1.0]), "the file knows better");
     write(2, 1);
     let cloud = read_cloud(&path).unwrap();
     assert_eq!((cloud.len(), cloud.viewpoint), (2, None));
+    assert_eq!(viewpoint(&elsewhere), elsewhere.viewpoint);
 }
 
 #[test]

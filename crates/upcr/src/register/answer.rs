@@ -39,14 +39,16 @@ impl Pipeline<'_> {
             all if all.len() > QUICKLY_SEEN && self.call.is_over() => Level::thin(&all, QUICKLY_SEEN),
             all => all,
         };
-        let forward = meeting(source, &held_out(self.source), target, pose, limit);
-        let backward = meeting(target, &held_out(self.target), source, &pose.inverse(), limit);
+        let [ours, theirs] = [held_out(self.source), held_out(self.target)];
+        let forward = meeting(source, &ours, target, pose, limit);
+        let backward = meeting(target, &theirs, source, &pose.inverse(), limit);
         let uncertainty = self.uncertainty(pose);
         let (agreement, glimpsed) = self.glimpsed(pose);
         let tolerance = self.match_tolerance();
         let explained = |matches: &[Match]| matches.iter().filter(|m| m.agrees_with(pose, tolerance)).count();
         let evidence = Evidence {
             closeness: best.closeness,
+            in_free_space: self.in_free_space(pose, [&ours, &theirs]),
             runner_up: others.first().map_or(0.0, |c| relative(c)),
             rivals: others.iter().filter(|c| relative(c) >= RIVALLING).count(),
             glimpsed,
@@ -87,6 +89,7 @@ impl Pipeline<'_> {
     fn glimpsed(&self, pose: &Rigid) -> (f64, f64) {
         let (source, target) = (self.source.coarse(), self.target.coarse());
         let here = overlap_at(source, target, pose, COMPARING_POINTS, self.coarse_reach()).score(2);
+        let here = here * self.clearance(pose);
         let (same, others): (Vec<&Glimpse>, Vec<&Glimpse>) =
             self.glimpses.iter().partition(|glimpse| self.coarsely_same(&glimpse.pose, pose));
         let proposed = |glimpses: &[&Glimpse]| glimpses.iter().filter(|g| g.proposed).count();

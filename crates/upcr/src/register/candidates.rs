@@ -5,11 +5,11 @@ use rayon::prelude::*;
 use super::Pipeline;
 use crate::{
     hypothesis::{Hypothesis, separation, turned},
-    prepare::Level,
+    prepare::{Level, Prepared},
     refine::{Refined, Refinement, Schedule},
     settings::Method,
     transform::Rigid,
-    verify::overlap_at,
+    verify::{Seen, in_free_space, overlap_at},
 };
 
 /// Hypotheses that are refined on the coarse level, and of those on the fine one.
@@ -38,6 +38,10 @@ const FEW_POINTS: usize = 1500;
 pub(super) const FINE_POINTS: usize = 6000;
 /// Scales over which refined poses are compared, each half the one before.
 const SCORING_SCALES: u32 = 4;
+/// A pose loses a factor of e of its score for each such share of the points that it sets in free space.
+const TOLERATED_IN_FREE_SPACE: f64 = 0.1;
+/// Points of each cloud that are looked at for it.
+const CLEARING_POINTS: usize = 500;
 /// Poses closer than this many voxels at the source's rim are one answer.
 const DISTINCT_VOXELS: f64 = 6.0;
 
@@ -84,7 +88,7 @@ impl Pipeline<'_> {
             let icp = self.icp(source, target);
             let refined = ranked.par_iter().map(|(_, h)| {
                 let pose = icp.refine(&moved, &h.pose, &Schedule::coarse(limit)).pose;
-                (rank(&pose, COMPARING_POINTS), Hypothesis { pose, ..*h })
+                (rank(&pose, COMPARING_POINTS) * self.clearance(&pose), Hypothesis { pose, ..*h })
             });
             refined.collect()
         };
@@ -175,7 +179,24 @@ impl Pipeline<'_> {
         let score = overlap.score(SCORING_SCALES);
         let closeness = score / overlap.score(1).max(f64::MIN_POSITIVE);
         // Walls that slide along each other overlap more than those that stand where they belong, but less closely.
-        Candidate { method: hypothesis.method, refined, score: score * closeness, closeness, complete: true }
+        let score = score * closeness * self.clearance(&refined.pose);
+        Candidate { method: hypothesis.method, refined, score, closeness, complete: true }
+    }
+
+    /// What is left of a pose's score for the points that it sets where a sensor saw past them, 1 where there are none.
+    pub(super) fn clearance(&self, pose: &Rigid) -> f64 {
+        let seen = |cloud: &Prepared| cloud.fine.spread(CLEARING_POINTS);
+        let share = self.in_free_space(pose, [&seen(self.source), &seen(self.target)]);
+        share.map_or(1.0, |share| (-share / TOLERATED_IN_FREE_SPACE).exp())
+    }
+
+    /// Share of the points of source and target that `pose` sets in free space, where that is known.
+    pub(super) fn in_free_space(&self, pose: &Rigid, points: [&[u32]; 2]) -> Option<f64> {
+        let [source, target] = points;
+        let [seen_source, seen_target] = &self.views;
+        let source = Seen { level: &self.source.fine, points: source, view: seen_source.as_ref() };
+        let target = Seen { level: &self.target.fine, points: target, view: seen_target.as_ref() };
+        in_free_space(source, target, pose)
     }
 
     /// Whether two poses, finely refined, are one answer.

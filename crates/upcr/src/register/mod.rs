@@ -18,7 +18,7 @@ use crate::{
     settings::{Method, Settings},
     threads::on_threads,
     transform::Rigid,
-    verify::{Calibration, Sizes},
+    verify::{Calibration, Sizes, View},
     watch::{Call, Stage, Stop, Watch},
 };
 use answer::{glanced_radius, nothing_known};
@@ -169,6 +169,8 @@ struct Pipeline<'a> {
     asks_network: bool,
     init: Rigid,
     lock: Option<LockedPose>,
+    /// What the sensors of source and target saw.
+    views: [Option<View>; 2],
     matches: Vec<Match>,
     glimpses: Vec<Glimpse>,
     candidates: Vec<Candidate>,
@@ -182,6 +184,7 @@ impl<'a> Pipeline<'a> {
         let init = settings.first_guess();
         let lock = LockedPose::new(settings.locks, &init, source.origin, target.origin);
         let init = to_local(&init, source, target);
+        let views = rayon::join(|| View::of(source), || View::of(target)).into();
         Ok(Self {
             source,
             target,
@@ -191,6 +194,7 @@ impl<'a> Pipeline<'a> {
             asks_network,
             init,
             lock,
+            views,
             matches: Vec::new(),
             glimpses: Vec::new(),
             candidates: Vec::new(),

@@ -13,13 +13,15 @@ use crate::{Error, Result};
 const EMBEDDED: &str = include_str!("calibration.json");
 
 /// What [`Evidence`] becomes before it is weighed, one number each.
-pub const FEATURES: [&str; 18] = [
+pub const FEATURES: [&str; 20] = [
     "smaller_overlap",
     "closeness",
     "ln_residual_ratio",
     "near_misses",
     "facing",
     "ln_facing_ratio",
+    "ln_in_free_space",
+    "no_viewpoint",
     "margin",
     "glimpsed",
     "rivals",
@@ -51,6 +53,8 @@ impl Evidence {
             self.near_misses,
             facing,
             ((facing + 0.01) / (own_facing + 0.01)).ln(),
+            (1.0 + self.in_free_space.unwrap_or(0.0) / 0.01).ln(),
+            f64::from(self.in_free_space.is_none()),
             (1.0 - self.runner_up).clamp(0.0, 0.6),
             self.glimpsed.min(1.0),
             self.rivals.min(3) as f64,
