@@ -86,7 +86,7 @@ impl Icp<'_> {
     }
 
     /// Share of a small motion of the source that pulls pairs apart instead of re-forming them: along the surface
-    /// and across it.
+    /// (either way) and across it.
     fn adherence(&self, pairs: &[Correspondence], pose: &Rigid, reach: f32) -> [f64; 2] {
         let step = MOVE_VOXELS * f64::from(self.target.voxel_size);
         let nearest = |y: Vector3<f64>| {
@@ -101,7 +101,8 @@ impl Icp<'_> {
                 let follows = nearest(y + way * step)? - nearest(y - way * step)?;
                 Some(1.0 - follows.dot(&way) / (2.0 * step))
             };
-            Some([share(along)?, share(n)?])
+            // Few of the pairs re-form, and those by far: the mean over one way alone is uncertain.
+            Some([f64::midpoint(share(along)?, share(n.cross(&along))?), share(n)?])
         };
         let sample: Vec<&Correspondence> = pairs.iter().step_by(pairs.len().div_ceil(MOVED_PAIRS)).collect();
         let shares: Vec<[f64; 2]> =
