@@ -12,7 +12,7 @@ use crate::{prepare::Level, transform::Rigid, watch::Call};
 /// Source points are matched in blocks of this many; the blocks' results stand in order.
 const BLOCK: usize = 256;
 /// Surfaces that face more than this far apart (cosine) are not the same surface.
-const NORMAL_COSINE: f32 = 0.5;
+pub(super) const NORMAL_COSINE: f32 = 0.5;
 /// Fewer pairs than a pose has degrees of freedom hold none.
 pub(super) const FEWEST_PAIRS: usize = 6;
 /// No target point was near.

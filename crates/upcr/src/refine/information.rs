@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::{
     Icp, Schedule,
-    icp::FEWEST_PAIRS,
+    icp::{FEWEST_PAIRS, NORMAL_COSINE},
     solver::{Correspondence, Objective},
 };
 use crate::transform::Rigid;
@@ -16,6 +16,10 @@ const PATCH_VOXELS: f64 = 4.0;
 /// Pairs that tell the adherence, and how far they are moved, in voxels: no further than poses err.
 const MOVED_PAIRS: usize = 512;
 const MOVE_VOXELS: f64 = 0.15;
+
+/// Mean squared difference of normals, over the most that is allowed: at 0.5 they would say nothing, of this or more it
+/// cannot be told how little.
+const MOST_DIFFERENT: f64 = 0.45;
 
 /// All in the left twist (rotation rad, translation) about the target's local origin.
 pub(crate) struct Information {
@@ -28,6 +32,9 @@ pub(crate) struct Information {
     /// Share of a small slide along the surface that pulls pairs apart instead of re-forming them: near 1 where both
     /// clouds hold the same samples, near 0 where each has its own.
     pub adherence: f64,
+    /// What normals of no meaning would seem to agree on, over their disagreement, because only pairs whose normals are
+    /// alike are pairs: 0 where nearly all would be anyhow.
+    pub agreement_by_choice: f64,
     /// The surface, piece by piece.
     pub patches: Vec<Patch>,
 }
@@ -51,8 +58,13 @@ pub(crate) struct Patch {
 impl Information {
     /// The sums over all patches.
     pub fn of(patches: Vec<Patch>, adherence: f64) -> Self {
-        let sum = |of: fn(&Patch) -> Matrix6<f64>| patches.iter().map(of).sum();
+        let sum = |of: fn(&Patch) -> Matrix6<f64>| -> Matrix6<f64> { patches.iter().map(of).sum() };
+        // n · m and |n − m|² / 2; together 1 a pair.
+        let [alike, apart] =
+            [sum(|p| p.agreement), sum(|p| p.disagreement)].map(|m| m.fixed_view::<3, 3>(3, 3).trace());
+        let most = 2.0 - 2.0 * f64::from(NORMAL_COSINE);
         Self {
+            agreement_by_choice: agreement_by_choice(2.0 * apart / ((alike + apart) * most)),
             stiffness: sum(|p| p.stiffness),
             hessian: sum(|p| p.hessian),
             gradient: patches.iter().map(|p| p.gradient).sum(),
@@ -154,6 +166,20 @@ impl Surface<'_> {
         }
         sum
     }
+}
+
+/// What choosing pairs whose normals are alike adds to their agreement, over their disagreement; `mean`: of their squared
+/// differences, over the most that is allowed.
+///
+/// Normals with errors a and b agree on ab = ((a + b) / 2)² − ((a − b) / 2)². Of Gaussian errors, both squares are
+/// independent and of one mean; the choice reduces the second alone, say to 1/t, which leaves ab at (t − 1) / 2 of the
+/// disagreement (a − b)² / 2. The squared difference of two normals is exponential, and cut off at the most allowed.
+fn agreement_by_choice(mean: f64) -> f64 {
+    const ITERATIONS: usize = 64;
+    let mean = if mean > 1e-3 { mean.min(MOST_DIFFERENT) } else { return 0.0 };
+    // The mean of an exponential variable cut off at 1 is 1 / rate − 1 / (exp rate − 1).
+    let rate = (0..ITERATIONS).fold(1.0 / mean, |rate, _| (1.0 - rate / rate.exp_m1()) / mean);
+    (1.0 / (rate * mean) - 1.0) / 2.0
 }
 
 /// The normals of a pair in the target's frame, the source's turned to the target's side.
@@ -470,16 +496,19 @@ mod tests {
         for (source, target) in [(&plane, &plane), (&other, &plane), (&plane, &other)] {
             let aligned =
                 Rigid::from_translation(target.origin).inverse() * Rigid::from_translation(source.origin);
-            // Along the plane and across it.
-            for way in [Vector3::y(), Vector3::z()] {
-                let at = |by: f64| {
-                    let pose = Rigid::from_translation((way * by).into()) * aligned;
-                    information(source, target, &pose, Refinement::Point)
-                };
-                let axis = 3 + way.imax();
-                let expected = (at(step).gradient[axis] - at(-step).gradient[axis]) / (2.0 * step);
-                let here = at(0.0);
-                let (found, held) = (here.stiffness[(axis, axis)], here.hessian[(axis, axis)]);
+            let at = |by: Vector3<f64>| {
+                let pose = Rigid::from_translation(by.into()) * aligned;
+                information(source, target, &pose, Refinement::Point)
+            };
+            let change = |axis: usize| {
+                let by = Vector3::ith(axis, step);
+                (at(by).gradient[3 + axis] - at(-by).gradient[3 + axis]) / (2.0 * step)
+            };
+            let here = at(Vector3::zeros());
+            // Along the plane, either way alike, and across it.
+            for (axis, expected) in [(1, f64::midpoint(change(0), change(1))), (2, change(2))] {
+                let at = (3 + axis, 3 + axis);
+                let (found, held) = (here.stiffness[at], here.hessian[at]);
                 // What is below zero by chance counts as zero.
                 assert!((found - expected.max(0.0)).abs() < 1e-3 * held, "{found} {expected} {held}");
             }
@@ -542,5 +571,28 @@ mod tests {
         let found = normal_variance(&pairs, &pose);
         let expected = sigma * sigma / 2.0;
         assert!((found / expected - 1.0).abs() < 0.05, "{found} {expected}");
+    }
+
+    #[test]
+    fn errors_agree_by_choice_as_much_as_is_said() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        for (sigma, expected) in [(0.1, 0.0..0.001), (0.3, 0.05..0.15), (0.4, 0.2..0.4), (0.5, 0.5..0.8)] {
+            let mut error = || sigma * normal(&mut rng);
+            let (mut pairs, mut agreement, mut difference) = (0.0, 0.0, 0.0);
+            for _ in 0..100_000 {
+                let [a, b] = [[error(), error()], [error(), error()]];
+                let squared = (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2);
+                if squared < 1.0 {
+                    pairs += 1.0;
+                    agreement += a[0] * b[0] + a[1] * b[1];
+                    difference += squared;
+                }
+            }
+            let (found, told) = (2.0 * agreement / difference, agreement_by_choice(difference / pairs));
+            assert!((found - told).abs() < 0.02 && expected.contains(&told), "{sigma}: {found} {told}");
+        }
+        assert_eq!(agreement_by_choice(0.0), 0.0);
+        assert!(agreement_by_choice(1.0) < 2.0);
+        assert_eq!(agreement_by_choice(f64::NAN), 0.0);
     }
 }

@@ -115,7 +115,7 @@ impl Pipeline<'_> {
             None => Matrix6xX::identity(6),
         };
         match icp.information(&moved, pose, &schedule) {
-            Some(information) => Uncertainty::of(&information, &tangent, radius, self.samples()),
+            Some(information) => Uncertainty::of(&information, &tangent, radius),
             None => Uncertainty::unknown(radius),
         }
     }

@@ -114,7 +114,10 @@ mod tests {
             (Evidence { in_free_space: Some(0.1), ..GOOD }, Reason::SeenThrough),
             (Evidence { free_directions: 1, ..GOOD }, Reason::DegenerateAxis),
             (Evidence { points: 20, ..GOOD }, Reason::TooFewPoints),
-            (Evidence { closeness: 0.35, near_misses: 0.6, ..GOOD }, Reason::PoorFit),
+            (
+                Evidence { closeness: 0.35, near_misses: 0.6, matches: Some([5, 800]), ..GOOD },
+                Reason::PoorFit,
+            ),
         ];
         for (evidence, reason) in cases {
             let verdict = verdict_on(&evidence);
