@@ -205,3 +205,55 @@ pub(super) fn write(out: &mut Output, header: &Header, cloud: &PointCloud) -> Fa
     for_each_batch(cloud, header, |batch| Ok(compressor.compress_many(batch)?))?;
     Ok(compressor.done()?)
 }
+
+#[cfg(test)]
+mod tests {
+    use ::laz::encoders::ArithmeticEncoder;
+    use ::laz::models::ArithmeticModelBuilder;
+    use ::laz::record::{LayeredPointRecordCompressor, RecordCompressor};
+
+    use super::*;
+
+    /// A decoder that follows every change of the times' sequence by a call of its own fills its stack.
+    #[test]
+    fn a_layer_of_endless_changes_of_sequence_is_not_followed() {
+        const RECORD: usize = 30;
+        const LAYERS: usize = 9;
+        let cloud = PointCloud::from_points((0..50).map(|i| [f64::from(i), 1.0, 2.0]).collect());
+        let base = Header::for_cloud(&cloud).unwrap();
+        let header = Header { compressed: true, point_format: 6, record_length: RECORD as u16, ..base };
+        let mut records = Vec::new();
+        for_each_batch(&cloud, &header, |batch| {
+            records.extend_from_slice(batch);
+            Ok(())
+        })
+        .unwrap();
+        for (i, record) in records.chunks_exact_mut(RECORD).enumerate() {
+            record[22..].copy_from_slice(&(i as u64 * 977).to_le_bytes());
+        }
+        let items = LazItemRecordBuilder::default_for_point_format_id(6, 0).unwrap();
+        let mut coder = LayeredPointRecordCompressor::new(Cursor::new(Vec::new()));
+        coder.set_fields_from(&items).unwrap();
+        coder.compress_many(&records).unwrap();
+        coder.done().unwrap();
+        let mut bytes = coder.into_inner().into_inner();
+
+        // The times' layer is the last. Its second of five symbols upward change the sequence.
+        let mut model = ArithmeticModelBuilder::new(5).with_compression(true).build();
+        let mut coder = ArithmeticEncoder::new(Cursor::new(Vec::new()));
+        for _ in 0..1_000_000 {
+            coder.encode_symbol(&mut model, 2).unwrap();
+        }
+        coder.done().unwrap();
+        let changes = coder.into_inner().into_inner();
+        let size_at = RECORD + 4 + 4 * (LAYERS - 1);
+        let old = u32::from_le_bytes(bytes[size_at..size_at + 4].try_into().unwrap()) as usize;
+        assert!(old > 0);
+        bytes.truncate(bytes.len() - old);
+        bytes[size_at..size_at + 4].copy_from_slice(&(changes.len() as u32).to_le_bytes());
+        bytes.extend(changes);
+
+        let found = decode(Chunk { bytes, count: 50 }, &header, &items).unwrap();
+        assert_eq!(found.points, cloud.points);
+    }
+}
