@@ -35,6 +35,9 @@ pub struct Args {
     /// Seed of that drawing
     #[arg(long, value_name = "N", default_value_t = 0)]
     seed: u64,
+    /// Multiply all lengths by this, e.g. 0.001 to make metres of millimetres; before `--transform`
+    #[arg(long, value_name = "FACTOR", value_parser = factor, allow_negative_numbers = true)]
+    scale: Option<f64>,
     /// Move the cloud by the pose in this text file (a 4x4 row-major matrix)
     #[arg(long, value_name = "FILE")]
     transform: Option<PathBuf>,
@@ -65,6 +68,12 @@ fn outliers(text: &str) -> Result<(usize, f64)> {
     Ok((k, ratio))
 }
 
+fn factor(text: &str) -> Result<f64> {
+    let factor: f64 = text.trim().parse()?;
+    ensure!(factor.is_finite() && factor > 0.0, "a positive number is needed");
+    Ok(factor)
+}
+
 pub fn run(args: &Args) -> Result<ExitCode> {
     let mut progress = Progress::new();
     progress.step("reading");
@@ -88,6 +97,9 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     }
     if let Some(count) = args.random {
         points = points.random_sample(count, args.seed);
+    }
+    if let Some(factor) = args.scale {
+        points = points.scaled(factor);
     }
     if let Some(path) = &args.transform {
         points = points.transformed(&io::read_transform(path)?);

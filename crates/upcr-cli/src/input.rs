@@ -23,8 +23,9 @@ pub struct Reading {
     /// Depth image units per metre
     #[arg(long, value_name = "N", default_value_t = ReadOptions::default().depth_scale)]
     depth_scale: f64,
-    /// Where the sensor stood when it took a scan, in the file's frame and unit, if the file does not say: 0,0,0 for scans
-    /// in their sensor's frame. For clouds that are one scan each, seen from one place
+    /// Where the sensor stood, in the frame and unit of the file; one value for all files, each in its own frame. Files that
+    /// say it themselves win. 0,0,0 is right for scans as a lidar or a depth camera gives them, not for every scan that
+    /// has a frame of its own, and nothing is for clouds merged from several
     #[arg(long, value_name = "X,Y,Z", value_parser = viewpoint, allow_hyphen_values = true)]
     viewpoint: Option<Viewpoint>,
 }
@@ -69,11 +70,10 @@ fn intrinsics(text: &str) -> anyhow::Result<Intrinsics> {
 }
 
 fn viewpoint(text: &str) -> anyhow::Result<Viewpoint> {
-    let [x, y, z] = numbers(text)?[..] else { bail!("three numbers are needed") };
-    if ![x, y, z].iter().all(|v| v.is_finite()) {
-        bail!("the place is not finite");
+    match numbers(text).as_deref() {
+        Ok(&[x, y, z]) if [x, y, z].iter().all(|v| v.is_finite()) => Ok(Viewpoint([x, y, z])),
+        _ => bail!("three finite numbers are needed, as in 0,0,0"),
     }
-    Ok(Viewpoint([x, y, z]))
 }
 
 fn numbers(text: &str) -> Result<Vec<f64>, ParseFloatError> {

@@ -74,7 +74,7 @@ pub struct Args {
     /// Seconds after which a registration ends with the best pose so far; reading files is not counted [default: no limit]
     #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
     max_seconds: Option<f64>,
-    /// Memory that a registration may take, e.g. `512M` or `2G` (K, M and G are powers of 1024). Where a cloud needs more,
+    /// Memory that a registration may take, e.g. `512M` or `2G` (K, M, G and T are powers of 1024). Where a cloud needs more,
     /// every second, fourth, ... point of it is used. The clouds themselves, as the files' readers hold them, and the
     /// weights of `--weights` are not counted [default: no limit]
     #[arg(long, value_name = "BYTES", value_parser = bytes)]
@@ -296,6 +296,18 @@ fn register_pair(
     upcr::register(&a, &b, &settings).map_err(|error| input::name_file(error, source, target))
 }
 
+/// Angle and axis.
+fn rotation(pose: &Rigid) -> String {
+    let rotation = pose.log().fixed_rows::<3>(0).into_owned();
+    let angle = rotation.norm();
+    let mut text = format!("{:.4}°", angle.to_degrees());
+    if angle > 0.0 {
+        let axis = rotation / angle;
+        let _ = write!(text, " about ({:.4}, {:.4}, {:.4})", axis[0], axis[1], axis[2]);
+    }
+    text
+}
+
 fn summary(found: &Registration, args: &Args, source: &Path, target: &Path) -> String {
     let pose = &found.T_target_source;
     let mut text = format!("{} -> {}\n\nT_target_source\n", source.display(), target.display());
@@ -305,15 +317,9 @@ fn summary(found: &Registration, args: &Args, source: &Path, target: &Path) -> S
         let _ = writeln!(text, "  {a:>10.6} {b:>10.6} {c:>10.6} {t:>15.6}");
     }
 
-    let rotation = pose.log().fixed_rows::<3>(0).into_owned();
-    let angle = rotation.norm();
-    let _ = write!(text, "\nrotation     {:.4}°", angle.to_degrees());
-    if angle > 0.0 {
-        let axis = rotation / angle;
-        let _ = write!(text, " about ({:.4}, {:.4}, {:.4})", axis[0], axis[1], axis[2]);
-    }
+    let _ = writeln!(text, "\nrotation     {}", rotation(pose));
     let t = pose.translation;
-    let _ = writeln!(text, "\ntranslation  ({:.6}, {:.6}, {:.6}), length {:.6}", t[0], t[1], t[2], t.norm());
+    let _ = writeln!(text, "translation  ({:.6}, {:.6}, {:.6}), length {:.6}", t[0], t[1], t[2], t.norm());
 
     let p = found.probability;
     let _ = if found.is_trustworthy() {
@@ -330,12 +336,12 @@ fn summary(found: &Registration, args: &Args, source: &Path, target: &Path) -> S
     }
     for (rank, other) in found.alternatives.iter().enumerate() {
         let T = &other.T_target_source;
-        let turned = (T.inverse() * *pose).angle().to_degrees();
         let t = T.translation;
         let _ = writeln!(
             text,
-            "alternative  {}: turned by {turned:.2}°, translation ({:.6}, {:.6}, {:.6}), score {:.3} of the best",
+            "alternative  {}: rotation {}, translation ({:.6}, {:.6}, {:.6}), score {:.3} of the best",
             rank + 1,
+            rotation(T),
             t[0],
             t[1],
             t[2],

@@ -30,7 +30,7 @@ pub enum Reason {
     ScaleMismatch,
     /// The refinement did not settle: no inliers to settle on, or no iterations left.
     NotConverged,
-    /// The surfaces lie near each other, but not as closely as right poses let them.
+    /// The surfaces do not lie on each other as they do at right poses: the evidence alone makes the pose improbable.
     PoorFit,
     /// The time limit ended the call before it was done.
     TimeLimit,
@@ -48,12 +48,12 @@ impl std::fmt::Display for Reason {
                 "points of one cloud stand where the other's sensor saw through to something behind"
             }
             Self::DegenerateAxis => "some direction of motion is not held by the geometry",
-            Self::TooFewPoints => "there are too few points to tell",
+            Self::TooFewPoints => "too few points are left at this scale, or meet, to tell",
             Self::ScaleMismatch => {
                 "the clouds differ so much in size that they seem to be in different units"
             }
             Self::NotConverged => "the refinement did not settle",
-            Self::PoorFit => "the surfaces lie near each other, but not as closely as a right pose lets them",
+            Self::PoorFit => "the surfaces do not lie on each other as they do where a pose is right",
             Self::TimeLimit => "the time limit ended the search early",
             Self::Cancelled => "the search was cancelled",
         })

@@ -57,6 +57,24 @@ fn convert_thins_and_moves() {
 }
 
 #[test]
+fn convert_changes_the_unit() {
+    let scratch = Scratch::new();
+    let metres = scratch.xyz("metres.xyz", &surface(20, 1.0));
+    let millimetres = scratch.path("millimetres.pcd");
+    let run = upcr(["convert", &metres, &millimetres, "--scale", "1000", "--viewpoint", "0,0,2"]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let [before, after] = [&metres, &millimetres].map(|file| upcr(["info", file, "--json"]).json());
+    for k in 0..3 {
+        let [before, after] = [&before, &after].map(|info| info["max"][k].as_f64().unwrap());
+        assert!((after / 1000.0 - before).abs() < 1e-6, "{before} {after}");
+    }
+    assert_eq!(after["viewpoint"], serde_json::json!([0.0, 0.0, 2000.0]));
+    for factor in ["0", "-1", "inf", "big"] {
+        assert_eq!(upcr(["convert", &metres, &millimetres, "--scale", factor]).status, 2);
+    }
+}
+
+#[test]
 fn features_are_one_row_a_point() {
     let scratch = Scratch::new();
     let cloud = scratch.xyz("cloud.xyz", &surface(20, 1.0));

@@ -84,6 +84,17 @@ impl PointCloud {
         }
     }
 
+    /// The cloud with all lengths times `factor`, which is positive; normals stay as they are.
+    #[must_use]
+    pub fn scaled(&self, factor: f64) -> Self {
+        let scaled = |p: &[f64; 3]| p.map(|v| v * factor);
+        Self {
+            points: self.points.iter().map(scaled).collect(),
+            viewpoint: self.viewpoint.as_ref().map(scaled),
+            ..self.clone()
+        }
+    }
+
     /// The cloud moved by `pose`: positions and viewpoint as points, normals as directions.
     #[must_use]
     pub fn transformed(&self, pose: &Rigid) -> Self {

@@ -51,16 +51,18 @@ pub(crate) fn judge(e: &Evidence, calibration: &Calibration) -> Verdict {
         }
     }
     let mut probability = calibration.probability(e);
+    // The other reasons say what is there to be told; where it does not look right either, that is one more.
+    if probability < TRUSTWORTHY
+        && !reasons.iter().any(|r| matches!(r, Reason::NoOverlap | Reason::TooFewPoints))
+    {
+        reasons.push(Reason::PoorFit);
+    }
     if e.points < FEWEST_FITTED {
         probability = probability.min(UNSURE);
     }
-    if !reasons.is_empty() {
-        let against_the_pose = |r: &Reason| *r != Reason::LowOverlap;
-        if reasons.iter().any(against_the_pose) {
-            probability = probability.min(DOUBTFUL);
-        }
-    } else if probability < TRUSTWORTHY {
-        reasons.push(Reason::PoorFit);
+    let against_the_pose = |r: &Reason| !matches!(r, Reason::LowOverlap | Reason::PoorFit);
+    if reasons.iter().any(against_the_pose) {
+        probability = probability.min(DOUBTFUL);
     }
     if reasons.contains(&Reason::NoOverlap) {
         probability = 0.0;
