@@ -15,7 +15,8 @@ use serde_json::Value;
 use upcr::features::MatchedFeature;
 use upcr::net::Network;
 use upcr::{
-    Calibration, Locks, Method, PointCloud, Refinement, Registration, RobustKernel, Settings, Watch, io,
+    Calibration, Locks, Method, PointCloud, Refinement, Registration, Rigid, RobustKernel, Settings, Watch,
+    io,
 };
 
 use crate::output::{self, Progress};

@@ -210,7 +210,9 @@ mod tests {
         let coded = |symbols: &[u32]| {
             let mut model = ArithmeticModelBuilder::new(STILL_SYMBOLS).with_compression(true).build();
             let mut coder = ArithmeticEncoder::new(Cursor::new(Vec::new()));
-            symbols.iter().for_each(|&symbol| coder.encode_symbol(&mut model, symbol).unwrap());
+            for &symbol in symbols {
+                coder.encode_symbol(&mut model, symbol).unwrap();
+            }
             coder.done().unwrap();
             coder.into_inner().into_inner()
         };
