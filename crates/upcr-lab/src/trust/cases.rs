@@ -492,9 +492,8 @@ fn virtual_place(rng: &mut impl Rng) -> Result<Place> {
     // Built-in scenes are of one size each; things in the world are not.
     let size: f64 = rng.random_range(0.7..1.4);
     let resized = |scan: Scan| {
-        let points = scan.cloud.points.iter().map(|p| p.map(|v| size * v)).collect();
         let pose = Rigid { translation: scan.T_world_sensor.translation * size, ..scan.T_world_sensor };
-        (PointCloud { points, ..scan.cloud }, pose)
+        (scan.cloud.scaled(size), pose)
     };
     let scans = synth(&settings)?.into_iter().map(resized).collect();
     Ok(Place { scans, tolerance, warp })

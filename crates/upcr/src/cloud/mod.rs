@@ -90,8 +90,9 @@ impl PointCloud {
         let scaled = |p: &[f64; 3]| p.map(|v| v * factor);
         Self {
             points: self.points.iter().map(scaled).collect(),
+            normals: self.normals.clone(),
+            colors: self.colors.clone(),
             viewpoint: self.viewpoint.as_ref().map(scaled),
-            ..self.clone()
         }
     }
 

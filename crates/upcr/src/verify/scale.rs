@@ -97,9 +97,8 @@ impl Sizes {
 fn scaled(cloud: &PointCloud, factor: f64) -> PointCloud {
     const POINTS: usize = 50_000;
     let step = cloud.len().div_ceil(POINTS).max(1);
-    let points = cloud.points.iter().step_by(step).map(|p| p.map(|v| v * factor)).collect();
-    let viewpoint = cloud.viewpoint.map(|p| p.map(|v| v * factor));
-    PointCloud { viewpoint, ..PointCloud::from_points(points) }
+    let few = PointCloud::from_points(cloud.points.iter().step_by(step).copied().collect());
+    PointCloud { viewpoint: cloud.viewpoint, ..few }.scaled(factor)
 }
 
 #[cfg(test)]
