@@ -1,7 +1,6 @@
 //! `upcr adapt`: learned weights learn on from the clouds at hand, without labels.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
@@ -12,6 +11,7 @@ use upcr_lab::models::Learned;
 use upcr_lab::models::tensor_file::TensorFile;
 use upcr_lab::train::{Poses, TrainingConfig, adapt};
 
+use crate::Status;
 use crate::output;
 use crate::pairs::Pairs;
 use crate::train::{Backend, Teller};
@@ -89,11 +89,11 @@ impl From<Part> for Split {
     }
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     output::on_threads(args.threads, || learn(args))?
 }
 
-fn learn(args: &Args) -> Result<ExitCode> {
+fn learn(args: &Args) -> Result<Status> {
     let bytes = std::fs::read(&args.weights).with_context(|| args.weights.display().to_string())?;
     let file = TensorFile::from_bytes(&bytes, &args.weights)?;
     let network = Learned::restore(&file, &args.weights, &args.backend.device().autodiff())?;
@@ -136,5 +136,5 @@ fn learn(args: &Args) -> Result<ExitCode> {
         if done.helped { "the adapted weights are kept" } else { "no better, the old weights are kept" }
     ));
     output::answer(&format!("{}\n", path.display()))?;
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }

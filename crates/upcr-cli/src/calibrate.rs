@@ -1,7 +1,6 @@
 //! `upcr calibrate`: fitting the probability that a pose is right, and measuring what the verdicts are worth.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -15,6 +14,7 @@ use upcr_lab::trust::{
     Observed, Reliability, Trust, asked_in_all_ways, covariance, fit, free_axes, markdown, observe, picture,
 };
 
+use crate::Status;
 use crate::output::{self, Progress};
 
 /// Fit the probability that a pose is right, and measure what the verdicts are worth
@@ -93,7 +93,7 @@ struct Test {
     out: PathBuf,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     match &args.task {
         Task::Fit(args) => output::on_threads(args.threads, || run_fit(args))?,
         Task::Test(args) => output::on_threads(args.threads, || run_test(args))?,
@@ -120,7 +120,7 @@ fn name(path: &Path) -> String {
     full.file_name().map_or_else(|| path.display().to_string(), |name| name.to_string_lossy().into_owned())
 }
 
-fn run_fit(args: &Fit) -> Result<ExitCode> {
+fn run_fit(args: &Fit) -> Result<Status> {
     for path in args.observed.iter().chain([&args.out]) {
         output::check_folder(path)?;
     }
@@ -164,10 +164,10 @@ fn run_fit(args: &Fit) -> Result<ExitCode> {
         "{} pairs, {} right; on these, before reasons against a pose cap it: calibration error {:.4}, area under ROC {area}\n{text}",
         found.counts.pairs, found.counts.right, found.expected_calibration_error
     ))?;
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }
 
-fn run_test(args: &Test) -> Result<ExitCode> {
+fn run_test(args: &Test) -> Result<Status> {
     std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
     let calibration = args.calibration.as_deref().map(Calibration::load).transpose()?.map(Arc::new);
     let settings = Settings { calibration, ..Settings::default() };
@@ -225,5 +225,5 @@ fn run_test(args: &Test) -> Result<ExitCode> {
     write_atomically(&file("results.json"), serde_json::to_string_pretty(&results)?.as_bytes())?;
     write_atomically(&file("report.md"), text.as_bytes())?;
     output::answer(&text)?;
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }

@@ -1,11 +1,11 @@
 //! `upcr convert`: from one format to another, thinned or moved on the way.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use anyhow::{Context, Result, ensure};
 use upcr::io::{self, Encoding};
 
+use crate::Status;
 use crate::input;
 use crate::output::{Progress, note};
 
@@ -74,7 +74,7 @@ fn factor(text: &str) -> Result<f64> {
     Ok(factor)
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     let mut progress = Progress::new();
     progress.step("reading");
     let mut points = args.reading.read(&args.input)?;
@@ -108,5 +108,5 @@ pub fn run(args: &Args) -> Result<ExitCode> {
     io::write_cloud_with(&args.output, &points, &io::WriteOptions { encoding: args.encoding() })?;
     drop(progress);
     note(&format!("{}: {} of {read} points", args.output.display(), points.len()));
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }

@@ -1,7 +1,6 @@
 //! `upcr eval`: methods side by side on the pairs of a protocol.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::sync::Arc;
 
 #[cfg(feature = "train")]
@@ -17,6 +16,7 @@ use upcr_lab::files::write_atomically;
 #[cfg(feature = "train")]
 use upcr_lab::models::{Learned, tensor_file::TensorFile};
 
+use crate::Status;
 use crate::output::{self, Progress};
 use crate::pairs::Pairs;
 
@@ -75,7 +75,7 @@ impl Overlap {
     }
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     output::on_threads(args.threads, || compare(args))?
 }
 
@@ -99,7 +99,7 @@ fn evaluated(method: &str) -> Result<EvaluatedMethod> {
     Ok(EvaluatedMethod::by_name("upcr")?.with_network(name, Network::load(path)?))
 }
 
-fn compare(args: &Args) -> Result<ExitCode> {
+fn compare(args: &Args) -> Result<Status> {
     if let Some(path) = &args.out {
         output::check_folder(path)?;
         if path.extension().is_some_and(|extension| extension == "csv") {
@@ -154,5 +154,5 @@ fn compare(args: &Args) -> Result<ExitCode> {
         write_atomically(&path.with_extension("csv"), csv(&rows).as_bytes())?;
     }
     output::answer(&markdown(&rows))?;
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }

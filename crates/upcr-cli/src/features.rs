@@ -2,7 +2,6 @@
 
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use anyhow::Result;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -11,6 +10,7 @@ use upcr::cloud::Support;
 use upcr::features::{self, DescribeTimings, Feature};
 use upcr::io;
 
+use crate::Status;
 use crate::input;
 use crate::output::{self, Progress};
 
@@ -54,7 +54,7 @@ struct Report {
     timings_ms: DescribeTimings,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     let mut progress = Progress::new();
     progress.step("reading");
     let cloud = args.reading.read(&args.cloud)?;
@@ -78,5 +78,5 @@ pub fn run(args: &Args) -> Result<ExitCode> {
             report.points, report.dim, ms.total, ms.neighbors, ms.normals, ms.feature
         ))?;
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }

@@ -2,11 +2,11 @@
 
 use std::fmt::Write;
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use anyhow::Result;
 use upcr::cloud::Summary;
 
+use crate::Status;
 use crate::{input, output};
 
 /// Say what a file holds
@@ -21,14 +21,14 @@ pub struct Args {
     reading: input::Reading,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     let summary = args.reading.read(&args.file)?.summary();
     if args.json {
         output::answer_json(&summary)?;
     } else {
         output::answer(&lines(&summary))?;
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }
 
 fn lines(summary: &Summary) -> String {

@@ -5,7 +5,6 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, stdin};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result, bail};
@@ -20,7 +19,7 @@ use upcr::{
 };
 
 use crate::output::{self, Progress};
-use crate::{NOT_REGISTERED, describe, input};
+use crate::{Status, describe, input};
 
 /// Find the pose that lays SOURCE on TARGET
 #[derive(clap::Args)]
@@ -164,18 +163,15 @@ fn bytes(text: &str) -> Result<u64> {
     number.checked_mul(1 << shift).context("more than there is")
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
-    if let Some(threads) = args.threads {
-        rayon::ThreadPoolBuilder::new().num_threads(threads.get()).build_global()?;
-    }
-    match (&args.pairs, &args.source, &args.target) {
+pub fn run(args: &Args) -> Result<Status> {
+    output::on_threads(args.threads, || match (&args.pairs, &args.source, &args.target) {
         (Some(list), ..) => run_pairs(args, list),
         (None, Some(source), Some(target)) => run_one(args, source, target),
         _ => bail!("a source and a target are needed"),
-    }
+    })?
 }
 
-fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<ExitCode> {
+fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status> {
     let settings = args.settings()?;
     for path in [&args.transform, &args.output].into_iter().flatten() {
         output::check_folder(path)?;
@@ -207,7 +203,7 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<ExitCo
     } else {
         output::answer(&summary(&found, args, source_path, target_path))?;
     }
-    Ok(if trusted { ExitCode::SUCCESS } else { ExitCode::from(NOT_REGISTERED) })
+    Ok(if trusted { Status::Done } else { Status::NotRegistered })
 }
 
 /// An answer as JSON.
@@ -230,7 +226,7 @@ struct PairAnswer<'a> {
 }
 
 /// Registers the pairs of a list one after the other; an error is told in its pair's place and ends nothing.
-fn run_pairs(args: &Args, list: &Path) -> Result<ExitCode> {
+fn run_pairs(args: &Args, list: &Path) -> Result<Status> {
     let settings = args.settings()?;
     let lines: Box<dyn BufRead> = if list.as_os_str() == "-" {
         Box::new(stdin().lock())
@@ -262,9 +258,9 @@ fn run_pairs(args: &Args, list: &Path) -> Result<ExitCode> {
         output::answer_json_line(&args.told(&PairAnswer { source, target, found, error })?)?;
     }
     Ok(match (failed, untrusted) {
-        (true, _) => ExitCode::FAILURE,
-        (false, true) => ExitCode::from(NOT_REGISTERED),
-        (false, false) => ExitCode::SUCCESS,
+        (true, _) => Status::Failed,
+        (false, true) => Status::NotRegistered,
+        (false, false) => Status::Done,
     })
 }
 

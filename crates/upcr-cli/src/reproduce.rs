@@ -2,7 +2,6 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
 use upcr_lab::drawing;
@@ -11,7 +10,7 @@ use upcr_lab::experiments::{
 };
 use upcr_lab::files::write_atomically;
 
-use crate::STOPPED;
+use crate::Status;
 use crate::output;
 use crate::train::{Backend, Teller, duration};
 
@@ -49,11 +48,11 @@ pub struct Args {
     out: PathBuf,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     output::on_threads(args.threads, || reproduce(args))?
 }
 
-fn reproduce(args: &Args) -> Result<ExitCode> {
+fn reproduce(args: &Args) -> Result<Status> {
     let mut chosen = Vec::new();
     for name in &args.names {
         match name.as_str() {
@@ -102,10 +101,10 @@ fn reproduce(args: &Args) -> Result<ExitCode> {
     }
     if !results.finished {
         output::note("stopped; the same command goes on");
-        return Ok(ExitCode::from(STOPPED));
+        return Ok(Status::Stopped);
     }
     output::answer(&format!("{}\n", path.display()))?;
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }
 
 /// An experiment of the program's, or of a file.

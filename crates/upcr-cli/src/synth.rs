@@ -1,13 +1,13 @@
 //! `upcr synth`: scans of a made-up scene, with their true poses.
 
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
 
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
 use upcr::io;
 use upcr_lab::data::scanner::{Optics, RangeNoise, Scene, Sensor, SynthSettings, synth};
 
+use crate::Status;
 use crate::output::{self, Progress};
 
 const AFTER_HELP: &str = "\
@@ -151,7 +151,7 @@ fn range(text: &str) -> Result<[f64; 2]> {
     Ok([shortest.trim().parse()?, longest.trim().parse()?])
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     let mut progress = Progress::new();
     progress.step("scanning");
     let scans = synth(&args.settings()?)?;
@@ -174,5 +174,5 @@ pub fn run(args: &Args) -> Result<ExitCode> {
         let shared = shared.unwrap_or_default();
         output::answer(&format!("{}: {} points{shared}\n", path.display(), scan.cloud.len()))?;
     }
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }

@@ -1,7 +1,6 @@
 //! `upcr train`: a network learned without labels.
 
 use std::path::PathBuf;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -14,7 +13,7 @@ use upcr_lab::files::write_atomically;
 use upcr_lab::models::LearnedConfig;
 use upcr_lab::train::{Event, Trainer, TrainingConfig, Watcher, write_history};
 
-use crate::STOPPED;
+use crate::Status;
 use crate::output;
 use crate::pairs::Pairs;
 
@@ -108,11 +107,11 @@ struct Run {
     training: TrainingConfig,
 }
 
-pub fn run(args: &Args) -> Result<ExitCode> {
+pub fn run(args: &Args) -> Result<Status> {
     output::on_threads(args.threads, || train(args))?
 }
 
-fn train(args: &Args) -> Result<ExitCode> {
+fn train(args: &Args) -> Result<Status> {
     let device = args.backend.device();
     let (folder, run, mut trainer) = match &args.resume {
         Some(folder) => {
@@ -138,12 +137,12 @@ fn train(args: &Args) -> Result<ExitCode> {
     write_history(&folder, trainer.history())?;
     if !done {
         output::note(&format!("stopped; go on with: upcr train --resume {}", folder.display()));
-        return Ok(ExitCode::from(STOPPED));
+        return Ok(Status::Stopped);
     }
     let weights = folder.join("weights.safetensors");
     write_atomically(&weights, &trainer.weights().to_bytes()?)?;
     output::answer(&format!("{}\n", weights.display()))?;
-    Ok(ExitCode::SUCCESS)
+    Ok(Status::Done)
 }
 
 fn start(args: &Args, device: &upcr_lab::Device) -> Result<(PathBuf, Run, Trainer)> {
