@@ -9,7 +9,7 @@ use upcr_lab::data::{self, Split, pairs::POINTS};
 use upcr_lab::files::write_atomically;
 use upcr_lab::models::Learned;
 use upcr_lab::models::tensor_file::TensorFile;
-use upcr_lab::train::{Poses, TrainingConfig, adapt};
+use upcr_lab::train::{ADAPTATION_EPOCHS, ADAPTATION_RATE, Poses, TrainingConfig, adapt};
 
 use crate::Status;
 use crate::output;
@@ -37,7 +37,7 @@ pub struct Args {
     #[arg(long, value_enum, default_value_t = Part::All)]
     split: Part,
     /// Pairs that are made of the clouds
-    #[arg(long, value_enum, default_value_t = Pairs::Mixed)]
+    #[arg(long, value_enum, default_value_t = Pairs::ADAPTATION)]
     protocol: Pairs,
     /// Keep three quarters of each cloud
     #[arg(long)]
@@ -46,13 +46,13 @@ pub struct Args {
     #[arg(long)]
     fixed_pairs: bool,
     /// Passes over the clouds
-    #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = ADAPTATION_EPOCHS, value_parser = clap::value_parser!(u64).range(1..))]
     epochs: u64,
     /// Points of a cloud
     #[arg(long, value_name = "N", default_value_t = POINTS)]
     points: usize,
     /// Adam's step size at the start
-    #[arg(long, value_name = "SIZE", default_value_t = 1e-4)]
+    #[arg(long, value_name = "SIZE", default_value_t = ADAPTATION_RATE)]
     learning_rate: f64,
     /// Seed of the pairs
     #[arg(long, default_value_t = 0)]

@@ -24,6 +24,8 @@ use std::ffi::OsString;
 
 use clap::{Parser, Subcommand};
 
+pub use pairs::Pairs;
+
 /// How a command ended, as the exit status tells it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[repr(u8)]

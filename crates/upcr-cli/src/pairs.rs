@@ -10,7 +10,7 @@ use upcr_lab::data::pairs::Protocol;
 use upcr_lab::data::{self, Half, Shapes, Split};
 
 /// Pairs that are made of shapes.
-#[derive(Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Pairs {
     /// Unseen point clouds: the training split
@@ -24,6 +24,10 @@ pub enum Pairs {
 }
 
 impl Pairs {
+    /// Those that adaptation learns from where nothing else is asked for.
+    pub const ADAPTATION: Self = Self::Mixed;
+
+    /// The protocols that these pairs follow, each with its share; `partial` keeps three quarters of each cloud.
     #[cfg(feature = "train")]
     pub fn mixture(self, partial: bool) -> Vec<(Protocol, f64)> {
         let whole = Protocol::CONSISTENT;
@@ -44,7 +48,7 @@ impl Pairs {
         }
     }
 
-    pub fn shapes(self, path: &Path, split: Split) -> Result<Shapes> {
+    pub(crate) fn shapes(self, path: &Path, split: Split) -> Result<Shapes> {
         let shapes = match (self, split) {
             (Self::Uc, Split::Train) => data::open(path, Split::All)?.categories(Half::First),
             (Self::Uc, _) => data::open(path, Split::All)?.categories(Half::Second),

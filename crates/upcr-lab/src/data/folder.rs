@@ -7,7 +7,7 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
-use upcr::{Error, Result, io};
+use upcr::{Error, PointCloud, Result, io};
 
 use super::normalize::{sample, unit_sphere};
 use super::{DataSet, Shapes, Split};
@@ -35,11 +35,25 @@ fn read(folder: &Path, split: Split) -> Result<Shapes> {
 }
 
 fn read_shape(path: &Path, index: usize) -> Result<Vec<[f32; 3]>> {
-    // Scanners write NaN where they saw nothing.
-    let cloud = io::read_cloud(path)?.finite();
-    let shape = sample(cloud, &mut random::stream(random::fnv1a("folder"), index as u64));
-    unit_sphere(&shape)
+    shape(&io::read_cloud(path)?, index)
         .map_err(|error| Error::Unsupported { path: path.to_owned(), reason: error.to_string() })
+}
+
+fn shape(cloud: &PointCloud, index: usize) -> Result<Vec<[f32; 3]>> {
+    // Scanners write NaN where they saw nothing.
+    unit_sphere(&sample(cloud.finite(), &mut random::stream(random::fnv1a("folder"), index as u64)))
+}
+
+impl Shapes {
+    /// Clouds in memory as shapes of one category: those that a folder gives that holds them in this order.
+    ///
+    /// # Errors
+    /// Where a cloud has no two different points that are finite.
+    pub fn from_clouds(clouds: &[PointCloud]) -> Result<Self> {
+        let shapes: Vec<_> =
+            clouds.par_iter().enumerate().map(|(i, cloud)| shape(cloud, i)).collect::<Result<_>>()?;
+        Ok(Self { labels: vec![0; shapes.len()], clouds: shapes, names: vec!["shapes".into()] })
+    }
 }
 
 /// The clouds' files, by name.
@@ -60,8 +74,6 @@ fn files(folder: &Path) -> Result<Vec<PathBuf>> {
 
 #[cfg(test)]
 mod tests {
-    use upcr::PointCloud;
-
     use super::*;
     use crate::data;
     use crate::data::tests::published;
@@ -86,6 +98,10 @@ mod tests {
         assert_eq!(sizes(Split::Train), [3, 4, 5, 6, 8]);
         assert_eq!(sizes(Split::Test), [7]);
         assert_eq!(sizes(Split::All), [3, 4, 5, 6, 7, 8]);
+        let read: Vec<PointCloud> =
+            files(folder.path()).unwrap().iter().map(|path| io::read_cloud(path).unwrap()).collect();
+        let whole = data::open(folder.path(), Split::All).unwrap();
+        assert_eq!(Shapes::from_clouds(&read).unwrap().clouds, whole.clouds);
         let mut along: Vec<f32> =
             data::open(folder.path(), Split::All).unwrap().clouds[0].iter().map(|p| p[0]).collect();
         along.sort_by(f32::total_cmp);

@@ -30,12 +30,17 @@ pub struct Adaptation {
     pub finished: bool,
 }
 
+/// Passes over the clouds in the paper's fine-tuning.
+pub const ADAPTATION_EPOCHS: u64 = 200;
+/// Its step size at the start.
+pub const ADAPTATION_RATE: f64 = 1e-4;
+
 impl TrainingConfig {
-    /// The paper's fine-tuning: 200 epochs from a step size of 1e-4, on clouds of so many points.
+    /// The paper's fine-tuning, on clouds of so many points; it has [`ADAPTATION_EPOCHS`].
     pub fn adaptation(network: &Learned, points: usize, epochs: u64) -> Self {
         Self {
             stages: vec![Stage { points, k: None, batch: 26, length: Length::Epochs(epochs) }],
-            learning_rate: 1e-4,
+            learning_rate: ADAPTATION_RATE,
             decay: Decay::Cosine,
             network: network.config(),
             ..Self::default()

@@ -7,7 +7,7 @@ mod history;
 mod plot;
 mod trainer;
 
-pub use adapt::{Adaptation, adapt};
+pub use adapt::{ADAPTATION_EPOCHS, ADAPTATION_RATE, Adaptation, adapt};
 pub use config::{Decay, Length, Stage, TrainingConfig};
 pub use history::{Event, History, Silent, ValidationErrors, Watcher};
 pub use plot::{learning_curve, write_history};

@@ -18,4 +18,4 @@ mod weights;
 pub use config::{GraphKind, NetworkConfig, RotationKind};
 pub use graph::Graph;
 pub use invariant::{Invariant, InvariantInputs};
-pub use network::{Network, Representations, centered};
+pub use network::{EMBEDDED_WEIGHTS, Network, Representations, centered};

@@ -16,6 +16,9 @@ use crate::error::{CloudRole, Error, Result};
 use crate::neighbors::KdTree;
 use crate::transform::Rigid;
 
+/// The weights file of the network that is part of the library ([`Network::embedded`]).
+pub static EMBEDDED_WEIGHTS: &[u8] = include_bytes!("../../weights/upcr.safetensors");
+
 /// A trained UPCR network, packed for inference.
 #[derive(Debug, Clone)]
 pub struct Network {
@@ -131,12 +134,11 @@ impl Network {
     /// # Errors
     /// None; it has the type of the other ways to a network.
     pub fn embedded() -> Result<Arc<Self>> {
-        static BYTES: &[u8] = include_bytes!("../../weights/upcr.safetensors");
         static NETWORK: OnceLock<Arc<Network>> = OnceLock::new();
         if let Some(network) = NETWORK.get() {
             return Ok(network.clone());
         }
-        let network = Arc::new(Self::from_safetensors(BYTES)?);
+        let network = Arc::new(Self::from_safetensors(EMBEDDED_WEIGHTS)?);
         Ok(NETWORK.get_or_init(|| network).clone())
     }
 

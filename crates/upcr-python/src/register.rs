@@ -1,0 +1,220 @@
+//! Registration: one pair, or many.
+
+use std::collections::HashMap;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+
+use numpy::PyArray2;
+use pyo3::exceptions::PyIndexError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList};
+use upcr::{PointCloud, Progress, Registration, Rigid, Settings, Watch, register_watched};
+
+use crate::call::{Caller, own_pool, pool, run};
+use crate::cloud::{Input, array, cloud_exception, viewpoint};
+use crate::objects::dictionary;
+use crate::settings::{pose, settings};
+
+/// Points of a cloud that a result keeps for its picture, at most.
+const PICTURED: usize = 600;
+
+/// A result with points of both clouds for its picture.
+struct Found {
+    registration: Registration,
+    pictured: [Vec<[f64; 3]>; 2],
+}
+
+/// What Python makes a result of: its fields, and points of the source and the target.
+type Parts<'py> = (Bound<'py, PyDict>, Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>);
+
+impl Found {
+    fn new(registration: Registration, source: &PointCloud, target: &PointCloud) -> Self {
+        Self { registration, pictured: [source, target].map(spread) }
+    }
+
+    fn into_parts(self, py: Python<'_>) -> PyResult<Parts<'_>> {
+        let Self { registration, pictured: [source, target] } = self;
+        let fields = dictionary(py, &registration)?;
+        fields.set_item("is_trustworthy", registration.is_trustworthy())?;
+        let caveats: Vec<String> = registration.reasons.iter().map(ToString::to_string).collect();
+        fields.set_item("caveats", caveats)?;
+        for (field, direction) in
+            fields_of(&fields, "free_directions")?.iter().zip(&registration.free_directions)
+        {
+            field.set_item("sentence", direction.to_string())?;
+        }
+        Ok((fields, array(py, source)?, array(py, target)?))
+    }
+}
+
+fn fields_of<'py>(fields: &Bound<'py, PyDict>, name: &str) -> PyResult<Bound<'py, PyList>> {
+    Ok(fields.as_any().get_item(name)?.cast_into::<PyList>()?)
+}
+
+/// Points from all over a cloud: of every so many in its order one, at changing places, as scanners' orders have periods.
+fn spread(cloud: &PointCloud) -> Vec<[f64; 3]> {
+    let (all, kept) = (cloud.len(), cloud.len().min(PICTURED));
+    let place = |i: usize| {
+        let (from, to) = (i * all / kept, (i + 1) * all / kept);
+        from + i.wrapping_mul(0x9e37_79b9) % (to - from)
+    };
+    (0..kept).map(|i| cloud.points[place(i)]).collect()
+}
+
+/// Registers one pair; `progress` is called with a stage, a method and the share that is done.
+#[pyfunction]
+#[pyo3(signature = (source, target, given, source_viewpoint, target_viewpoint, progress))]
+pub fn register<'py>(
+    py: Python<'py>,
+    source: Input,
+    target: Input,
+    given: &Bound<'py, PyDict>,
+    source_viewpoint: Option<[f64; 3]>,
+    target_viewpoint: Option<[f64; 3]>,
+    progress: Option<Bound<'py, PyAny>>,
+) -> PyResult<Parts<'py>> {
+    let settings = settings(given)?;
+    let viewpoints =
+        [viewpoint("source_viewpoint", source_viewpoint)?, viewpoint("target_viewpoint", target_viewpoint)?];
+    let (pool, told) = (pool(py)?, progress.is_some());
+    let work = move |caller: &Caller<Progress>| {
+        let found = pool.install(|| {
+            let (source, target) = (source.seen_from(viewpoints[0])?, target.seen_from(viewpoints[1])?);
+            let (cancelled, hear) = (|| caller.is_gone(), |progress| caller.tell(progress));
+            let watch = Watch { cancelled: Some(&cancelled), progress: told.then_some(&hear) };
+            let registration = register_watched(&source, &target, &settings, &watch)?;
+            Ok(Found::new(registration, &source, &target))
+        });
+        found.map_err(|error| cloud_exception(error, &source, &target))
+    };
+    let hear = |at: Progress| {
+        let Some(progress) = &progress else { return Ok(()) };
+        let at = dictionary(py, &at)?;
+        let field = |name| at.as_any().get_item(name);
+        progress.call1((field("stage")?, field("method")?, field("done")?)).map(drop)
+    };
+    run(py, work, hear)??.into_parts(py)
+}
+
+/// A pair of a batch with its own first guess, where it has one.
+struct Pair {
+    source: Arc<Input>,
+    target: Arc<Input>,
+    init: Option<Rigid>,
+}
+
+impl Pair {
+    fn register(&self, settings: &Settings, gone: &(dyn Fn() -> bool + Sync)) -> upcr::Result<Found> {
+        let settings = Settings { init: self.init.or(settings.init), threads: None, ..settings.clone() };
+        let (source, target) = (self.source.get()?, self.target.get()?);
+        let watch = Watch { cancelled: Some(gone), progress: None };
+        let registration = register_watched(&source, &target, &settings, &watch)?;
+        Ok(Found::new(registration, &source, &target))
+    }
+}
+
+/// Registers pairs of places in `clouds`, several at a time; results and exceptions come in the pairs' order. `progress`
+/// is called with the number of pairs done. Where `raises`, the first pair's exception ends it.
+#[pyfunction]
+#[pyo3(signature = (clouds, pairs, given, raises, progress))]
+pub fn register_batch<'py>(
+    py: Python<'py>,
+    clouds: Vec<Bound<'py, PyAny>>,
+    pairs: Vec<(usize, usize, Option<Bound<'py, PyAny>>)>,
+    given: &Bound<'py, PyDict>,
+    raises: bool,
+    progress: Option<Bound<'py, PyAny>>,
+) -> PyResult<Bound<'py, PyList>> {
+    let settings = settings(given)?;
+    let mut inputs = HashMap::new();
+    let mut input = |place: usize| -> PyResult<Arc<Input>> {
+        if let Some(input) = inputs.get(&place) {
+            return Ok(Arc::clone(input));
+        }
+        let cloud = clouds.get(place).ok_or_else(|| PyIndexError::new_err(place))?;
+        let input = Arc::new(cloud.extract::<Input>()?);
+        inputs.insert(place, input.clone());
+        Ok(input)
+    };
+    let pairs = pairs.into_iter().map(|(source, target, init)| {
+        let init = init.map(|init| pose("init", &init)).transpose()?;
+        Ok(Pair { source: input(source)?, target: input(target)?, init })
+    });
+    let pairs = Arc::new(pairs.collect::<PyResult<Vec<_>>>()?);
+    let threads = settings
+        .threads
+        .map_or_else(|| pool(py).map(rayon::ThreadPool::current_num_threads), |n| Ok(n.get()))?;
+    let batch = Batch { pairs: pairs.clone(), settings, threads, raises };
+    let mut done = 0_usize;
+    let hear = |()| {
+        done += 1;
+        progress.as_ref().map_or(Ok(()), |progress| progress.call1((done,)).map(drop))
+    };
+    let found = run(py, move |caller| batch.run(caller), hear)??;
+    let results = PyList::empty(py);
+    for (found, pair) in found.into_iter().zip(pairs.iter()) {
+        match found {
+            Some(Ok(found)) => results.append(found.into_parts(py)?)?,
+            Some(Err(error)) => {
+                let error = cloud_exception(error, &pair.source, &pair.target);
+                if raises {
+                    return Err(error);
+                }
+                results.append(error.into_value(py))?;
+            }
+            // Left out behind an error that is raised.
+            None => break,
+        }
+    }
+    Ok(results)
+}
+
+struct Batch {
+    pairs: Arc<Vec<Pair>>,
+    settings: Settings,
+    threads: usize,
+    raises: bool,
+}
+
+impl Batch {
+    /// Whole pairs on threads of their own: none waits for another's steps, and a time limit is each pair's. Where there are
+    /// fewer pairs than threads, a pair has several.
+    fn run(self, caller: &Caller<()>) -> PyResult<Vec<Option<upcr::Result<Found>>>> {
+        let Self { pairs, settings, threads, raises } = self;
+        let workers = threads.min(pairs.len()).max(1);
+        let next = AtomicUsize::new(0);
+        // Pairs before the first that failed are done, whatever the order of things.
+        let first_failed = AtomicUsize::new(usize::MAX);
+        let found: Mutex<Vec<_>> = Mutex::new(pairs.iter().map(|_| None).collect());
+        let is_gone = || caller.is_gone();
+        let work = || {
+            while !caller.is_gone() {
+                let i = next.fetch_add(1, Ordering::Relaxed);
+                let Some(pair) = pairs.get(i) else { break };
+                if i > first_failed.load(Ordering::Relaxed) {
+                    break;
+                }
+                let mut one = pair.register(&settings, &is_gone);
+                match &mut one {
+                    Ok(found) => found.registration.settings.threads = settings.threads,
+                    Err(_) if raises => {
+                        first_failed.fetch_min(i, Ordering::Relaxed);
+                    }
+                    Err(_) => {}
+                }
+                found.lock().unwrap_or_else(PoisonError::into_inner)[i] = Some(one);
+                caller.tell(());
+            }
+        };
+        // As even as it goes.
+        let share = |w: usize| (w + 1) * threads / workers - w * threads / workers;
+        let pools: Vec<_> = (0..workers).map(|w| own_pool(share(w))).collect::<PyResult<_>>()?;
+        thread::scope(|scope| {
+            for pool in &pools {
+                scope.spawn(|| pool.install(work));
+            }
+        });
+        Ok(found.into_inner().unwrap_or_else(PoisonError::into_inner))
+    }
+}

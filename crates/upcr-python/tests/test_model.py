@@ -1,0 +1,86 @@
+"""The network, and its adaptation."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SAMPLES, Points, bumpy, turn
+
+import upcr
+from upcr._adapt import Pairs
+from upcr._upcr import CHOICES
+
+
+def test_prediction(blob: Points) -> None:
+    model = upcr.Model.default()
+    shape = (blob - blob.mean(axis=0)) / np.linalg.norm(blob - blob.mean(axis=0), axis=1).max()
+    angles = []
+    for degrees in (10, 25, 40):
+        rotation = turn(degrees)
+        found = model.predict(shape.astype(np.float32), shape @ rotation.T + (0.1, 0.2, -0.1))
+        assert found.shape == (4, 4) and np.allclose(found[:3, :3] @ found[:3, :3].T, np.eye(3), atol=1e-6)
+        left = found[:3, :3] @ rotation.T
+        angles.append(np.degrees(np.arccos(np.clip((np.trace(left) - 1) / 2, -1, 1))))
+    assert np.mean(angles) < 20, angles
+    assert model.predict(SAMPLES / "source.ply", SAMPLES / "target.ply").shape == (4, 4)
+    with pytest.raises(upcr.CloudError, match="source has too few points"):
+        model.predict(np.zeros((0, 3)), shape)
+    with pytest.raises(upcr.CloudError, match="target has NaN"):
+        model.predict(shape, np.full((5, 3), np.nan))
+
+
+def test_models_come_and_go(tmp_path: Path) -> None:
+    model = upcr.Model.default()
+    assert model.is_trained and model.config["k"] > 0 and model.fingerprint in repr(model)
+    model.save(tmp_path / "a.safetensors")
+    for again in (
+        upcr.Model.load(tmp_path / "a.safetensors"),
+        upcr.Model.from_bytes(model.to_bytes()),
+        pickle.loads(pickle.dumps(model)),
+    ):
+        assert again == model and hash(again) == hash(model) and again.to_bytes() == model.to_bytes()
+    with pytest.raises(FileNotFoundError):
+        upcr.Model.load(tmp_path / "none.safetensors")
+    (tmp_path / "b.safetensors").write_bytes(b"no weights")
+    with pytest.raises(upcr.FormatError, match=r"b\.safetensors"):
+        upcr.Model.load(tmp_path / "b.safetensors")
+    with pytest.raises(upcr.WeightsError):
+        upcr.Model.from_bytes(b"no weights")
+
+
+@pytest.fixture(scope="module")
+def shapes() -> list[Points]:
+    return [bumpy(400, seed) * (1, 1 + 0.1 * seed, 1) for seed in range(3)]
+
+
+def test_adaptation(shapes: list[Points], tmp_path: Path) -> None:
+    heard: list[upcr.AdaptationProgress] = []
+    options = {"epochs": 2, "points": 128, "seed": 5}
+    done = upcr.adapt(shapes, folder=tmp_path / "run", progress=heard.append, **options)  # type: ignore[arg-type]
+    assert done.steps == 2 and heard and heard[-1].step == heard[-1].steps == 2
+    assert done.helped == (done.after.loss < done.before.loss) == (done.model != upcr.Model.default())
+    assert (tmp_path / "run" / "checkpoint.safetensors").exists()
+    # The same from files, whatever the number of threads.
+    for i, shape in enumerate(shapes):
+        upcr.write(tmp_path / f"{i}.npy", shape)
+    again = upcr.adapt(tmp_path, upcr.Model.default(), threads=1, **options)  # type: ignore[arg-type]
+    assert again.before == done.before and again.after == done.after and again.model == done.model
+    upcr.register(shapes[0], shapes[0], method="upcr", network=done.model)
+
+
+def test_what_adaptation_refuses(shapes: list[Points], tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        upcr.adapt(tmp_path / "none")
+    with pytest.raises(upcr.FormatError, match="no known data set"):
+        upcr.adapt(tmp_path)
+    with pytest.raises(upcr.SettingError, match="`epochs`"):
+        upcr.adapt(shapes, epochs=0)
+    with pytest.raises(upcr.SettingError, match="`pairs`: there is no odd"):
+        upcr.adapt(shapes, pairs="odd")  # type: ignore[arg-type]
+    with pytest.raises(upcr.CloudError, match="degenerate"):
+        upcr.adapt([np.zeros((50, 3))])
+
+
+def test_pairs_are_the_command_line_s() -> None:
+    assert set(Pairs.__args__) == set(CHOICES["pairs"])  # type: ignore[attr-defined]
