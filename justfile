@@ -14,6 +14,10 @@ sample:
 test:
     cargo test --workspace
 
+# Build the Python wheel and test it in a fresh environment
+python *args:
+    crates/upcr-python/test {{ args }}
+
 # Format the code
 fmt:
     cargo fmt

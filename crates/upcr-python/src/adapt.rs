@@ -12,7 +12,7 @@ use upcr_lab::data::{self, Shapes, Split, pairs::POINTS};
 use upcr_lab::models::{Learned, tensor_file::TensorFile};
 use upcr_lab::train::{self, ADAPTATION_EPOCHS, Adaptation, Event, Poses, TrainingConfig, Watcher};
 
-use crate::call::{Caller, own_pool, pool, run};
+use crate::call::{Caller, Place, own_pool, pool, run};
 use crate::cloud::Input;
 use crate::errors::{exception, setting};
 use crate::model::Model;
@@ -60,7 +60,7 @@ pub fn adapt<'py>(
     if options.epochs == Some(0) {
         return Err(setting("epochs", "at least one is needed"));
     }
-    let (shared, threads) = (pool(py)?, options.threads);
+    let threads = options.threads;
     let weights = weights.get().weights.clone();
     let work = move |caller: &Caller<(Event, f64)>| -> PyResult<(Adaptation, Vec<u8>)> {
         let learn = || -> upcr::Result<_> {
@@ -71,7 +71,7 @@ pub fn adapt<'py>(
         };
         let done = match threads {
             Some(threads) => own_pool(threads.get())?.install(learn),
-            None => shared.install(learn),
+            None => learn(),
         };
         done.map_err(exception)
     };
@@ -81,7 +81,7 @@ pub fn adapt<'py>(
         event.set_item("seconds_left", left)?;
         progress.call1((event,)).map(drop)
     };
-    let (done, bytes) = run(py, work, hear)??;
+    let (done, bytes) = run(py, Place::Pool(pool(py)?), work, hear)??;
     let fields = PyDict::new(py);
     fields.set_item("model", Model::from_bytes(py, bytes)?)?;
     fields.set_item("helped", done.helped)?;

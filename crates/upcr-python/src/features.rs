@@ -7,7 +7,7 @@ use pyo3::prelude::*;
 use upcr::cloud::Support;
 use upcr::features;
 
-use crate::call::{pool, run_silent};
+use crate::call::run_silent;
 use crate::cloud::{Input, cloud_exception};
 use crate::errors::setting;
 
@@ -27,9 +27,8 @@ pub fn describe<'py>(
         return Err(setting("kind", format_args!("there is no {kind}; there are {}", known.join(", "))));
     };
     let support = radius.map_or(Support::Nearest(k), Support::Radius);
-    let pool = pool(py)?;
     let (rows, _) = run_silent(py, move || {
-        let described = pool.install(|| features::describe(&*cloud.get()?, feature, support, threads));
+        let described = cloud.get().and_then(|cloud| features::describe(&cloud, feature, support, threads));
         described.map_err(|error| cloud_exception(error, &cloud, &cloud))
     })??;
     let shape = [rows.len(), rows.dim];

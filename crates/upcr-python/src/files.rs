@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use pyo3::prelude::*;
 use upcr::io::{self, Encoding, WriteOptions};
 
-use crate::call::{pool, run_silent};
+use crate::call::run_silent;
 use crate::cloud::{Columns, Input, Reading, columns};
 use crate::errors::{exception, setting};
 
@@ -13,8 +13,7 @@ use crate::errors::{exception, setting};
 #[pyfunction]
 pub fn read<'py>(py: Python<'py>, path: PathBuf, options: Reading) -> PyResult<Columns<'py>> {
     let options = options.options()?;
-    let pool = pool(py)?;
-    let cloud = run_silent(py, move || pool.install(|| io::read_cloud_with(path, &options)))?;
+    let cloud = run_silent(py, move || io::read_cloud_with(path, &options))?;
     columns(py, cloud.map_err(exception)?)
 }
 
@@ -32,7 +31,6 @@ pub fn write(py: Python<'_>, path: PathBuf, cloud: Input, encoding: Option<&str>
             return Err(setting("encoding", format_args!("there is no {other}; there are {known}")));
         }
     };
-    let pool = pool(py)?;
     let write = move || io::write_cloud_with(path, &*cloud.get()?, &WriteOptions { encoding });
-    run_silent(py, move || pool.install(write))?.map_err(exception)
+    run_silent(py, write)?.map_err(exception)
 }

@@ -10,7 +10,7 @@ use pyo3::types::{PyBytes, PyDict};
 use upcr::net::{EMBEDDED_WEIGHTS, Network};
 use upcr_lab::files::write_atomically;
 
-use crate::call::{pool, run_silent};
+use crate::call::run_silent;
 use crate::cloud::{array, rows};
 use crate::errors::exception;
 use crate::objects::dictionary;
@@ -86,8 +86,8 @@ impl Model {
         target: PyReadonlyArray2<'py, f32>,
     ) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let (source, target) = (rows("source", &source)?, rows("target", &target)?);
-        let (network, pool) = (self.network.clone(), pool(py)?);
-        let pose = run_silent(py, move || pool.install(|| network.predict(&source, &target)))?;
+        let network = self.network.clone();
+        let pose = run_silent(py, move || network.predict(&source, &target))?;
         array(py, pose.map_err(exception)?.to_rows().to_vec())
     }
 }

@@ -11,7 +11,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 use upcr::{PointCloud, Progress, Registration, Rigid, Settings, Watch, register_watched};
 
-use crate::call::{Caller, own_pool, pool, run};
+use crate::call::{Caller, Place, own_pool, pool, run};
 use crate::cloud::{Input, array, cloud_exception, viewpoint};
 use crate::objects::dictionary;
 use crate::settings::{pose, settings};
@@ -77,16 +77,16 @@ pub fn register<'py>(
     let settings = settings(given)?;
     let viewpoints =
         [viewpoint("source_viewpoint", source_viewpoint)?, viewpoint("target_viewpoint", target_viewpoint)?];
-    let (pool, told) = (pool(py)?, progress.is_some());
+    let told = progress.is_some();
     let work = move |caller: &Caller<Progress>| {
-        let found = pool.install(|| {
+        let found = || {
             let (source, target) = (source.seen_from(viewpoints[0])?, target.seen_from(viewpoints[1])?);
             let (cancelled, hear) = (|| caller.is_gone(), |progress| caller.tell(progress));
             let watch = Watch { cancelled: Some(&cancelled), progress: told.then_some(&hear) };
             let registration = register_watched(&source, &target, &settings, &watch)?;
             Ok(Found::new(registration, &source, &target))
-        });
-        found.map_err(|error| cloud_exception(error, &source, &target))
+        };
+        found().map_err(|error| cloud_exception(error, &source, &target))
     };
     let hear = |at: Progress| {
         let Some(progress) = &progress else { return Ok(()) };
@@ -94,7 +94,7 @@ pub fn register<'py>(
         let field = |name| at.as_any().get_item(name);
         progress.call1((field("stage")?, field("method")?, field("done")?)).map(drop)
     };
-    run(py, work, hear)??.into_parts(py)
+    run(py, Place::Pool(pool(py)?), work, hear)??.into_parts(py)
 }
 
 /// A pair of a batch with its own first guess, where it has one.
@@ -151,7 +151,7 @@ pub fn register_batch<'py>(
         done += 1;
         progress.as_ref().map_or(Ok(()), |progress| progress.call1((done,)).map(drop))
     };
-    let found = run(py, move |caller| batch.run(caller), hear)??;
+    let found = run(py, Place::Thread, move |caller| batch.run(caller), hear)??;
     let results = PyList::empty(py);
     for (found, pair) in found.into_iter().zip(pairs.iter()) {
         match found {

@@ -43,7 +43,8 @@ def bumpy(points: int, seed: int = 0) -> Points:
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     x, y, z = direction.T
     radius = 1 + 0.3 * np.sin(3 * x + 1) + 0.2 * np.cos(5 * y * z) + 0.25 * x * y - 0.2 * z
-    return direction * radius[:, None]
+    surface: Points = direction * radius[:, None]
+    return surface
 
 
 def turn(degrees: float, axis: tuple[float, float, float] = (0.2, 0.5, 0.84)) -> Points:

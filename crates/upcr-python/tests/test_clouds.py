@@ -3,7 +3,7 @@
 import copy
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def test_arrays_are_taken_over_or_converted(blob: Points) -> None:
     assert upcr.PointCloud(blob).points is blob
     cloud = full(blob)
     assert cloud.normals is not None and cloud.colors is not None and cloud.viewpoint is not None
-    assert (cloud.points.dtype, cloud.normals.dtype, cloud.colors.dtype) == (np.float64, np.float32, np.uint8)
+    assert cloud.points.dtype == np.float64 and cloud.normals.dtype == np.float32 and cloud.colors.dtype == np.uint8
     assert cloud.viewpoint.tolist() == [1, 2, 3]
     assert len(cloud) == 1024 and repr(cloud) == "<upcr.PointCloud: 1,024 points, normals, colors, seen from (1, 2, 3)>"
     for again in (copy.deepcopy(cloud), pickle.loads(pickle.dumps(cloud))):
@@ -48,8 +48,9 @@ def test_files(blob: Points, tmp_path: Path, name: str) -> None:
 
 def test_what_files_keep(blob: Points, tmp_path: Path) -> None:
     cloud = full(blob)
-    for encoding in ("binary", "ascii"):
-        upcr.write(tmp_path / "a.ply", cloud, encoding=encoding)  # type: ignore[arg-type]
+    encodings: tuple[Literal["binary", "ascii"], ...] = ("binary", "ascii")
+    for encoding in encodings:
+        upcr.write(tmp_path / "a.ply", cloud, encoding=encoding)
         read = upcr.read(tmp_path / "a.ply")
         assert np.array_equal(read.points, cloud.points) and np.array_equal(read.normals, cloud.normals)  # type: ignore[arg-type]
         assert np.array_equal(read.colors, cloud.colors)  # type: ignore[arg-type]
@@ -90,13 +91,14 @@ def test_a_moved_cloud(blob: Points) -> None:
     cloud = full(blob)
     moved = cloud.transformed(pose)
     assert np.allclose(moved.points, blob @ turn(40).T + (1, 2, 3))
-    assert moved.normals is not None and np.allclose(moved.normals, cloud.normals @ turn(40).T, atol=1e-6)
+    assert moved.normals is not None and cloud.normals is not None
+    assert np.allclose(moved.normals, cloud.normals @ turn(40).T, atol=1e-6)
     assert moved.viewpoint is not None and np.allclose(moved.viewpoint, turn(40) @ (1, 2, 3) + (1, 2, 3))
     assert equal(cloud, full(blob))
 
 
 def test_open3d(blob: Points, tmp_path: Path) -> None:
-    o3d: Any = pytest.importorskip("open3d", reason="open3d cannot be imported here")
+    o3d: Any = pytest.importorskip("open3d", reason="open3d cannot be imported", exc_type=ImportError)
     source = o3d.io.read_point_cloud(str(SAMPLES / "source.ply"))
     target = o3d.io.read_point_cloud(str(SAMPLES / "target.ply"))
     found = upcr.register(source, target)

@@ -45,9 +45,10 @@ def test_exit_statuses(tmp_path: Path) -> None:
     assert unknown.returncode == 2 and unknown.stdout == "" and "--magic" in unknown.stderr
     missing = run("info", "nowhere.ply")
     assert missing.returncode == 1 and missing.stderr.startswith("error: nowhere.ply")
-    x, y = np.random.default_rng(0).uniform(size=(2, 2000))
-    upcr.write(tmp_path / "plane.ply", np.stack([x, y, 0 * x], 1))
-    assert run("register", *2 * [str(tmp_path / "plane.ply")]).returncode == 3
+    for i in range(2):
+        x, y = np.random.default_rng(i).uniform(size=(2, 2000))
+        upcr.write(tmp_path / f"{i}.ply", np.stack([x, y, 0 * x], 1))
+    assert run("register", *(str(tmp_path / f"{i}.ply") for i in range(2))).returncode == 3
 
 
 def test_interruption(tmp_path: Path) -> None:

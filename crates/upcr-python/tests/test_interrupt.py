@@ -14,8 +14,8 @@ import upcr
 
 # Each prints a line when its long call begins.
 LONG = {
-    "register": "upcr.register(big, big @ turn, progress=begun)",
-    "register_batch": "print(flush=True); upcr.register_batch([(big, big @ turn)] * 20)",
+    "register": "upcr.register(big, big @ turn, voxel_size=0.002, progress=begun)",
+    "register_batch": "print(flush=True); upcr.register_batch([(big, big @ turn)] * 20, voxel_size=0.002)",
     "features": "print(flush=True); upcr.features.pfh(big, k=60)",
     "adapt": "print(flush=True); upcr.adapt([big[:5000]] * 30, epochs=500)",
 }

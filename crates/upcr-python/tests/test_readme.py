@@ -41,5 +41,6 @@ def test_import_is_quick() -> None:
 
 
 def test_all_is_there() -> None:
-    assert all(getattr(upcr, name).__doc__ for name in upcr.__all__ if not name.startswith("_") and name.isidentifier() and name not in ("CloudLike", "TRUSTWORTHY"))
-    assert upcr.TRUSTWORTHY == 0.5
+    described = [getattr(upcr, name) for name in upcr.__all__ if name not in ("CloudLike", "TRUSTWORTHY", "__version__")]
+    assert all(one.__doc__ for one in described)
+    assert 0 < upcr.TRUSTWORTHY < 1

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from . import _upcr
 
 if TYPE_CHECKING:
-    from ._upcr import Packed
+    from ._upcr import _Packed
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
@@ -134,7 +134,7 @@ def write(
     _upcr.write(os.fspath(path), packed(cloud, normals=True, colors=True), encoding)
 
 
-def packed(cloud: CloudLike, *, normals: bool = False, colors: bool = False) -> Packed:
+def packed(cloud: CloudLike, *, normals: bool = False, colors: bool = False) -> _Packed:
     """The cloud as the native half takes it: a file's name, or C-contiguous arrays, with what else is asked for."""
     if isinstance(cloud, (str, os.PathLike)):
         return os.fspath(cloud)

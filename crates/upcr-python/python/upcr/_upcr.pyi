@@ -10,9 +10,29 @@ _Floats: TypeAlias = npt.NDArray[np.float64]
 _Arrays: TypeAlias = tuple[
     _Floats, npt.NDArray[np.float32] | None, npt.NDArray[np.uint8] | None, tuple[float, float, float] | None
 ]
-Packed: TypeAlias = str | _Arrays
+_Packed: TypeAlias = str | _Arrays
 _Parts: TypeAlias = tuple[dict[str, Any], _Floats, _Floats]
 _Place: TypeAlias = tuple[float, float, float] | None
+
+__all__ = [
+    "CHOICES",
+    "DEFAULT_K",
+    "TRUSTWORTHY",
+    "CloudError",
+    "Error",
+    "FormatError",
+    "Model",
+    "SettingError",
+    "WeightsError",
+    "__version__",
+    "adapt",
+    "describe",
+    "main",
+    "read",
+    "register",
+    "register_batch",
+    "write",
+]
 
 CHOICES: Final[dict[str, list[str]]]
 DEFAULT_K: Final[int]
@@ -53,27 +73,27 @@ class Model:
     def config(self) -> dict[str, Any]: ...
 
 def register(
-    source: Packed,
-    target: Packed,
+    source: _Packed,
+    target: _Packed,
     given: dict[str, Any],
     source_viewpoint: _Place,
     target_viewpoint: _Place,
     progress: Callable[[Any, Any, Any], object] | None,
 ) -> _Parts: ...
 def register_batch(
-    clouds: Sequence[Packed],
+    clouds: Sequence[_Packed],
     pairs: Sequence[tuple[int, int, _Floats | str | None]],
     given: dict[str, Any],
     raises: bool,
     progress: Callable[[int], object] | None,
 ) -> list[_Parts | Exception]: ...
 def describe(
-    cloud: Packed, kind: str, k: int, radius: float | None, threads: int | None
+    cloud: _Packed, kind: str, k: int, radius: float | None, threads: int | None
 ) -> npt.NDArray[np.float32]: ...
 def read(path: str, options: dict[str, Any]) -> _Arrays: ...
-def write(path: str, cloud: Packed, encoding: str | None) -> None: ...
+def write(path: str, cloud: _Packed, encoding: str | None) -> None: ...
 def adapt(
-    clouds: str | list[Packed],
+    clouds: str | list[_Packed],
     weights: Model,
     folder: str,
     options: dict[str, Any],
