@@ -11,7 +11,7 @@ use crate::errors::{exception, setting};
 
 /// Reads a cloud: its points, normals, colours and viewpoint.
 #[pyfunction]
-pub fn read<'py>(py: Python<'py>, path: PathBuf, options: Reading) -> PyResult<Columns<'py>> {
+pub fn read(py: Python<'_>, path: PathBuf, options: Reading) -> PyResult<Columns<'_>> {
     let options = options.options()?;
     let cloud = run_silent(py, move || io::read_cloud_with(path, &options))?;
     columns(py, cloud.map_err(exception)?)

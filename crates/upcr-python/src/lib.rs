@@ -1,6 +1,9 @@
 //! The native half of the Python package `upcr`: arrays in, plain objects out. What users see of it is in
 //! `python/upcr`, which checks and shapes what goes in and gives what comes out its types.
 
+// Arguments come from Python by value.
+#![allow(clippy::needless_pass_by_value)]
+
 mod adapt;
 mod call;
 mod cloud;
@@ -14,7 +17,6 @@ mod settings;
 
 #[pyo3::pymodule]
 mod _upcr {
-    use pyo3::exceptions::PyKeyboardInterrupt;
     use pyo3::prelude::*;
 
     #[pymodule_export]
@@ -43,13 +45,7 @@ mod _upcr {
 
     /// The command line; returns its exit status. The first of `args` is the program's name.
     #[pyfunction]
-    fn main(py: Python<'_>, args: Vec<std::ffi::OsString>) -> PyResult<u8> {
-        let status = py.detach(|| upcr_cli::run(args)) as u8;
-        // A handler of Python's may have been called meanwhile.
-        py.check_signals().map_err(|error| match error.is_instance_of::<PyKeyboardInterrupt>(py) {
-            true => PyKeyboardInterrupt::new_err(()),
-            false => error,
-        })?;
-        Ok(status)
+    fn main(py: Python<'_>, args: Vec<std::ffi::OsString>) -> u8 {
+        py.detach(|| upcr_cli::run(args)) as u8
     }
 }
