@@ -105,6 +105,8 @@ def test_open3d(blob: Points, tmp_path: Path) -> None:
     assert found.is_trustworthy
     files = upcr.register(SAMPLES / "source.ply", SAMPLES / "target.ply")
     assert found.transformation.tobytes() == files.transformation.tobytes()
+    tensors = o3d.t.geometry.PointCloud.from_legacy(source, o3d.core.float64)
+    assert upcr.register(tensors, target).transformation.tobytes() == found.transformation.tobytes()
     source.transform(found.transformation)
     agreement = o3d.pipelines.registration.evaluate_registration(source, target, found.voxel_size)
     assert agreement.fitness > 0.5

@@ -140,6 +140,9 @@ def packed(cloud: CloudLike, *, normals: bool = False, colors: bool = False) -> 
         return os.fspath(cloud)
     if isinstance(cloud, np.ndarray):
         return _rows(cloud, np.float64, "points"), None, None, None
+    if hasattr(cloud, "to_legacy"):
+        # Open3D's clouds of tensors.
+        cloud = cloud.to_legacy()
     points = getattr(cloud, "points", None)
     if points is None:
         points = cloud
