@@ -14,9 +14,9 @@ import upcr
 
 # Each prints a line when its long call begins.
 LONG = {
-    "register": "upcr.register(big, big @ turn, voxel_size=0.002, progress=begun)",
-    "register_batch": "print(flush=True); upcr.register_batch([(big, big @ turn)] * 20, voxel_size=0.002)",
-    "features": "print(flush=True); upcr.features.pfh(big, k=60)",
+    "register": "upcr.register(big, moved, voxel_size=0.002, threads=1, progress=begun)",
+    "register_batch": "print(flush=True); upcr.register_batch([(big, moved)] * 20, voxel_size=0.002)",
+    "features": "print(flush=True); upcr.features.pfh(big, k=60, threads=1)",
     "adapt": "print(flush=True); upcr.adapt([big[:5000]] * 30, epochs=500)",
 }
 SCRIPT = """
@@ -26,7 +26,7 @@ import upcr
 big = np.random.default_rng(0).normal(size=(1_500_000, 3))
 big /= np.linalg.norm(big, axis=1, keepdims=True)
 big *= 1 + 0.2 * np.sin(4 * big[:, :1]) + 0.1 * np.cos(7 * big[:, 1:2])
-turn = np.linalg.qr(np.arange(9).reshape(3, 3) ** 2 + np.eye(3))[0]
+moved = big @ np.linalg.qr(np.arange(9).reshape(3, 3) ** 2 + np.eye(3))[0]
 first = []
 def begun(at):
     if not first:
@@ -47,7 +47,8 @@ def test_interruption(call: str) -> None:
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         process.stdout.readline()
-        time.sleep(0.3)
+        # Beyond the copying of the clouds.
+        time.sleep(0.7)
         assert process.poll() is None, "the call was too short"
         signaled = time.time()
         process.send_signal(signal.SIGINT)
