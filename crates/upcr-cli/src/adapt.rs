@@ -9,7 +9,7 @@ use upcr_lab::data::{self, Split, pairs::POINTS};
 use upcr_lab::files::write_atomically;
 use upcr_lab::models::Learned;
 use upcr_lab::models::tensor_file::TensorFile;
-use upcr_lab::train::{ADAPTATION_EPOCHS, ADAPTATION_RATE, Poses, TrainingConfig, adapt};
+use upcr_lab::train::{ADAPTATION_EPOCHS, ADAPTATION_RATE, Alone, Material, Poses, TrainingConfig, adapt};
 
 use crate::Status;
 use crate::output;
@@ -107,10 +107,13 @@ fn learn(args: &Args) -> Result<Status> {
     let mut config = TrainingConfig::adaptation(&network, args.points, args.epochs);
     config.learning_rate = args.learning_rate;
     config.seed = args.seed;
-    let mixture = args.protocol.mixture(args.partial);
-    let poses = if args.fixed_pairs { Poses::Fixed } else { Poses::Fresh };
+    let material = Material {
+        parts: vec![shapes],
+        mixture: args.protocol.mixture(args.partial),
+        poses: if args.fixed_pairs { Poses::Fixed } else { Poses::Fresh },
+    };
     let mut teller = Teller::new()?;
-    let done = adapt(&network, &shapes, &mixture, poses, config.clone(), &args.out, &mut teller)?;
+    let done = adapt(&network, &material, config.clone(), &args.out, &mut Alone, &mut teller)?;
     let path = args.out.join("weights.safetensors");
     write_atomically(&path, &done.network.store().to_bytes()?)?;
     let [before, after] = done.errors;

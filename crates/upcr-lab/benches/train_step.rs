@@ -11,7 +11,7 @@ use upcr_lab::Device;
 use upcr_lab::models::learned::NETWORKS;
 use upcr_lab::models::{Batch, LearnedConfig};
 use upcr_lab::random;
-use upcr_lab::train::{Trainer, TrainingConfig};
+use upcr_lab::train::{Alone, Trainer, TrainingConfig};
 
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
@@ -45,7 +45,7 @@ fn main() {
     let mut times_ms: Vec<f64> = (0..=repeats)
         .map(|_| {
             let start = Instant::now();
-            trainer.step(&batch, 1e-3).unwrap();
+            trainer.step(std::slice::from_ref(&batch), 1e-3, &mut Alone).unwrap();
             start.elapsed().as_secs_f64() * 1e3
         })
         .skip(1)

@@ -2,8 +2,10 @@
 #![cfg(feature = "train")]
 #![allow(missing_docs, clippy::unwrap_used, clippy::panic)]
 
+use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
 
 use rand::Rng;
 use upcr::net::NetworkConfig;
@@ -17,7 +19,9 @@ use upcr_lab::models::prnet::{PrnetConfig, Sampler};
 use upcr_lab::models::tensor_file::TensorFile;
 use upcr_lab::models::{Learned, LearnedConfig};
 use upcr_lab::random;
-use upcr_lab::train::{Event, Length, Poses, Stage, Trainer, TrainingConfig, Validation, Watcher, validate};
+use upcr_lab::train::{
+    Alone, Event, Length, Part, Poses, Stage, Team, Trainer, TrainingConfig, Validation, Watcher, validate,
+};
 
 fn shapes() -> Shapes {
     let cloud = |seed| -> Vec<[f32; 3]> {
@@ -106,7 +110,8 @@ fn every_network_learns_and_comes_back_from_its_file() {
         let config = TrainingConfig { stages, learning_rate: 5e-3, ..config(network.clone()) };
         let mut trainer = Trainer::new(config, folder.path(), &Device::flex()).unwrap();
         let pairs = Validation::new(&set, &mixture, 48, &network).unwrap();
-        trainer.run_on(&set, &set, &mixture, Poses::Fixed, &mut After(u32::MAX)).unwrap();
+        let part = Part { shapes: set.clone(), held_out: set.clone() };
+        trainer.run_on(&[part], &mixture, Poses::Fixed, &mut Alone, &mut After(u32::MAX)).unwrap();
         let history = trainer.history();
         let [first, last] = [history.first(), history.last()].map(|event| event.unwrap().loss);
         assert!(last < 0.8 * first, "{network:?}: {first} to {last}");
@@ -117,6 +122,65 @@ fn every_network_learns_and_comes_back_from_its_file() {
         let errors = [trainer.network(), &again].map(|network| validate(network, &pairs).unwrap());
         assert_eq!(errors[0], errors[1], "{network:?}");
     }
+}
+
+/// One of two who share a batch's parts out and hand each other rows through channels.
+struct Member {
+    first: bool,
+    out: Sender<Vec<Vec<f64>>>,
+    others: Receiver<Vec<Vec<f64>>>,
+}
+
+impl Team for Member {
+    fn own(&self, parts: usize) -> Range<usize> {
+        if self.first { 0..parts / 2 } else { parts / 2..parts }
+    }
+
+    fn gather(&mut self, own: Vec<Vec<f64>>) -> upcr::Result<Vec<Vec<f64>>> {
+        self.out.send(own.clone()).unwrap();
+        let others = self.others.recv().unwrap();
+        Ok(if self.first { [own, others] } else { [others, own] }.concat())
+    }
+}
+
+/// The tensors that a network has learned from the shapes' own parts.
+fn learned_in(parts: &[Shapes], config: &TrainingConfig, team: &mut dyn Team) -> TensorFile {
+    let folder = tempfile::tempdir().unwrap();
+    let mixture = vec![(Protocol::CONSISTENT, 1.0)];
+    let part =
+        |shapes: &Shapes| Part { shapes: Arc::new(shapes.clone()), held_out: Arc::new(shapes.clone()) };
+    let parts: Vec<Part> = parts.iter().map(part).collect();
+    let mut trainer = Trainer::new(config.clone(), folder.path(), &Device::flex()).unwrap();
+    assert!(trainer.run_on(&parts, &mixture, Poses::Fresh, team, &mut After(u32::MAX)).unwrap());
+    assert!(trainer.history().last().unwrap().validation.is_some());
+    trainer.weights()
+}
+
+#[test]
+fn a_team_learns_what_one_does_alone() {
+    let config = TrainingConfig { parts: 3, ..config(upcr()) };
+    let parts = shapes().in_parts(3);
+    let alone = learned_in(&parts, &config, &mut Alone);
+    let whole = learned_in(&[shapes()], &TrainingConfig { parts: 1, ..config.clone() }, &mut Alone);
+    assert_ne!(alone, whole, "parts normalise themselves");
+    let [(to_second, from_first), (to_first, from_second)] = [channel(), channel()];
+    let together = std::thread::scope(|scope| {
+        let mut second = Member { first: false, out: to_first, others: from_first };
+        let (theirs, config) = (&parts[1..], &config);
+        let other = scope.spawn(move || learned_in(theirs, config, &mut second));
+        let mut first = Member { first: true, out: to_second, others: from_second };
+        let own = learned_in(&parts[..1], config, &mut first);
+        [own, other.join().unwrap()]
+    });
+    assert_eq!(together[0], alone);
+    assert_eq!(together[1], alone);
+}
+
+#[test]
+fn more_parts_than_pairs_are_refused() {
+    let refused = TrainingConfig { parts: 1000, ..config(upcr()) }.check().unwrap_err();
+    assert!(refused.to_string().contains("parts"), "{refused}");
+    assert!(TrainingConfig { parts: 0, ..config(upcr()) }.check().is_err());
 }
 
 #[test]

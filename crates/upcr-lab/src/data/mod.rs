@@ -12,6 +12,7 @@ pub mod pairs;
 pub mod scanner;
 pub mod seven_scenes;
 
+use std::ops::Range;
 use std::path::Path;
 
 use upcr::{Error, Result};
@@ -81,6 +82,15 @@ pub fn open(path: impl AsRef<Path>, split: Split) -> Result<Shapes> {
     Ok(shapes)
 }
 
+/// The part `index` of so many consecutive parts of `length` things, as even as it goes.
+///
+/// ```
+/// assert_eq!(upcr_lab::data::share(7, 1, 3), 2..4);
+/// ```
+pub fn share(length: usize, index: usize, parts: usize) -> Range<usize> {
+    index * length / parts..(index + 1) * length / parts
+}
+
 impl Shapes {
     /// Number of shapes.
     pub fn len(&self) -> usize {
@@ -126,6 +136,19 @@ impl Shapes {
             }
         };
         (part(false), part(true))
+    }
+
+    /// So many sets of consecutive shapes, as even as it goes.
+    pub fn in_parts(&self, parts: usize) -> Vec<Self> {
+        let part = |index| {
+            let range = share(self.len(), index, parts);
+            Self {
+                clouds: self.clouds[range.clone()].to_vec(),
+                labels: self.labels[range].to_vec(),
+                names: self.names.clone(),
+            }
+        };
+        (0..parts).map(part).collect()
     }
 
     /// The shapes of half of the categories: those of the one are unseen to who has trained on the other.

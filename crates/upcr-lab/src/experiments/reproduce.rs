@@ -24,7 +24,9 @@ use crate::eval::metrics::{Tolerance, diameter};
 use crate::eval::run::{Row, evaluate_pairs};
 use crate::files::write_atomically;
 use crate::models::{Learned, LearnedConfig, tensor_file::TensorFile};
-use crate::train::{Length, Poses, Trainer, ValidationErrors, Watcher, adapt, write_history};
+use crate::train::{
+    Alone, Length, Material, Poses, Trainer, ValidationErrors, Watcher, adapt, write_history,
+};
 
 /// Where a reproduction is.
 #[derive(Debug, Clone, PartialEq)]
@@ -337,9 +339,12 @@ impl Store<'_> {
         told.starts(&format!("{weights} learns on"));
         let begun = Instant::now();
         let before = self.load(&weights.unadapted())?;
-        let mixture = vec![(adaptation.setting.protocol(self.run.budget.points), 1.0)];
-        let poses = if tested { Poses::Fixed } else { Poses::Fresh };
-        let found = adapt(&before, &shapes, &mixture, poses, config, folder, told.spectator)?;
+        let material = Material {
+            parts: vec![shapes.clone()],
+            mixture: vec![(adaptation.setting.protocol(self.run.budget.points), 1.0)],
+            poses: if tested { Poses::Fixed } else { Poses::Fresh },
+        };
+        let found = adapt(&before, &material, config, folder, &mut Alone, told.spectator)?;
         if !found.finished {
             return Ok(None);
         }

@@ -8,7 +8,8 @@ use upcr::Result;
 use super::config::{Decay, Length, Stage, TrainingConfig};
 use super::history::{ValidationErrors, Watcher};
 use super::plot::write_history;
-use super::trainer::{Poses, Trainer, Validation, validate};
+use super::team::Team;
+use super::trainer::{Part, Poses, Trainer, Validation, validate_together};
 use crate::data::Shapes;
 use crate::data::pairs::Mixture;
 use crate::models::Learned;
@@ -48,26 +49,43 @@ impl TrainingConfig {
     }
 }
 
-/// Learns on from all of `shapes` without labels. The run's checkpoint comes to `folder`; a run of the same
-/// configuration that was stopped there goes on.
+/// What is learned from.
+#[derive(Debug, Clone)]
+pub struct Material {
+    /// Shapes of each part that is the team's member's own.
+    pub parts: Vec<Arc<Shapes>>,
+    /// Pairs that are made of them.
+    pub mixture: Mixture,
+    /// Whether a shape's pair changes from epoch to epoch.
+    pub poses: Poses,
+}
+
+/// Learns on from all shapes without labels. The run's checkpoint comes to `folder`; a run of the same configuration
+/// that was stopped there goes on.
 ///
 /// # Errors
-/// As [`Trainer::run`].
+/// As [`Trainer::run_on`].
 pub fn adapt(
     network: &Learned,
-    shapes: &Arc<Shapes>,
-    mixture: &Mixture,
-    poses: Poses,
+    material: &Material,
     config: TrainingConfig,
     folder: &Path,
+    team: &mut dyn Team,
     watcher: &mut dyn Watcher,
 ) -> Result<Adaptation> {
+    let Material { parts, mixture, poses } = material;
     let points = config.stages.last().map_or(crate::data::pairs::POINTS, |stage| stage.points);
-    let validation = Validation::new(shapes, mixture, points, &network.config())?;
-    let before = validate(network, &validation)?;
+    let validations = parts.iter().map(|shapes| Validation::new(shapes, mixture, points, &network.config()));
+    let validations = validations.collect::<Result<Vec<_>>>()?;
+    let validate = |network: &Learned, team: &mut dyn Team| {
+        validate_together(network, &validations, team).map(Option::unwrap_or_default)
+    };
+    let before = validate(network, team)?;
     let mut trainer = Trainer::adapting(config, network, folder)?;
-    let finished = trainer.run_on(shapes, shapes, mixture, poses, watcher)?;
-    let after = validate(trainer.network(), &validation)?;
+    let part = |shapes: &Arc<Shapes>| Part { shapes: shapes.clone(), held_out: shapes.clone() };
+    let parts: Vec<Part> = parts.iter().map(part).collect();
+    let finished = trainer.run_on(&parts, mixture, *poses, team, watcher)?;
+    let after = validate(trainer.network(), team)?;
     let helped = after.loss < before.loss;
     let network = if helped { trainer.network() } else { network }.clone();
     write_history(folder, trainer.history())?;

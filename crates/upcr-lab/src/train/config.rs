@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use upcr::{Error, Result};
 
 use crate::models::LearnedConfig;
+use crate::random;
 
 /// A training run. The default is the paper's.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -23,6 +24,8 @@ pub struct TrainingConfig {
     pub validation_every_nth: usize,
     /// Steps between two validations.
     pub validation_steps: u64,
+    /// Parts in which a batch is seen, each normalising itself; several machines can share them out.
+    pub parts: usize,
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
     /// The network.
@@ -77,6 +80,7 @@ impl Default for TrainingConfig {
             warmup_steps: 0,
             validation_every_nth: 20,
             validation_steps: 1000,
+            parts: 1,
             checkpoint_seconds: 60.0,
             network: LearnedConfig::default(),
         }
@@ -144,6 +148,9 @@ impl TrainingConfig {
         if self.stages.iter().any(|s| s.points == 0 || s.batch == 0) || self.stages.is_empty() {
             return refused("stages", "there must be one at least, each with points and a batch");
         }
+        if self.parts == 0 || self.stages.iter().any(|stage| stage.batch < self.parts) {
+            return refused("parts", "there must be one at least, and no more than pairs of a batch");
+        }
         if !(self.learning_rate > 0.0 && self.learning_rate.is_finite()) {
             return refused("learning_rate", "must be positive and finite");
         }
@@ -166,6 +173,14 @@ impl TrainingConfig {
         };
         let warm = ((step + 1) as f64 / self.warmup_steps.max(1) as f64).min(1.0);
         self.learning_rate * decay * warm
+    }
+}
+
+impl TrainingConfig {
+    /// The seed of what is random in a part of something named so.
+    pub(super) fn seed_of(&self, what: &str, part: usize) -> u64 {
+        let part = if self.parts == 1 { String::new() } else { format!(" part {part}") };
+        random::fnv1a(&format!("{} {what}{part}", self.seed))
     }
 }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 /// Errors on pairs that no gradient came from, whose true poses are known.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct ValidationErrors {
     /// Mean loss: of UPCR the Chamfer distance between canonical shapes.
     pub loss: f64,

@@ -11,14 +11,14 @@ use upcr::{Error, Result};
 use super::checkpoint::{self, State};
 use super::config::{Length, Stage, TrainingConfig};
 use super::history::{Event, History, ValidationErrors, Watcher};
-use crate::data::Shapes;
+use super::team::{Alone, Lesson, Team, mean};
 pub use crate::data::loader::Poses;
 use crate::data::loader::{Example, Loader, Plan, Position, Training};
 use crate::data::pairs::Mixture;
+use crate::data::{Shapes, share};
 use crate::eval::metrics::{PoseErrors, Recall, Tolerance};
 use crate::models::tensor_file::TensorFile;
 use crate::models::{Batch, Learned, LearnedConfig};
-use crate::random;
 
 /// Share of a batch in the running statistics of batch norm.
 const STATISTICS_SHARE: f64 = 0.1;
@@ -92,6 +92,33 @@ pub fn validate(network: &Learned, validation: &Validation) -> Result<Validation
         mae_t: errors.translation_mae,
         recall: Recall::of(&poses, |_| Tolerance::object(DIAMETER)).share(),
     })
+}
+
+/// Errors of the parts' validations taken together; `None` where no part has a pair.
+pub(super) fn validate_together(
+    network: &Learned,
+    validations: &[Validation],
+    team: &mut dyn Team,
+) -> Result<Option<ValidationErrors>> {
+    let own = validations.iter().map(|validation| {
+        let pairs: usize = validation.batches.iter().map(|batch| batch.truths().len()).sum();
+        // The errors of no pairs are not told, and weigh nothing.
+        let found = if pairs == 0 { ValidationErrors::default() } else { validate(network, validation)? };
+        Ok(vec![pairs as f64, found.loss, found.mae_r_deg, found.mae_t, found.recall])
+    });
+    let own = own.collect::<Result<_>>()?;
+    let (pairs, mean) = mean(team, own)?;
+    let [loss, mae_r_deg, mae_t, recall] = mean[..] else { return Ok(None) };
+    Ok((pairs > 0.0).then_some(ValidationErrors { loss, mae_r_deg, mae_t, recall }))
+}
+
+/// A part of a run's shapes.
+#[derive(Debug, Clone)]
+pub struct Part {
+    /// Shapes to learn from.
+    pub shapes: Arc<Shapes>,
+    /// Shapes to measure errors on.
+    pub held_out: Arc<Shapes>,
 }
 
 impl Trainer {
@@ -186,23 +213,30 @@ impl Trainer {
     /// Where a shape has too few points, a file cannot be written, or the loss is no longer finite.
     pub fn run(&mut self, shapes: &Shapes, mixture: &Mixture, watcher: &mut dyn Watcher) -> Result<bool> {
         let (learned, held_out) = shapes.split_every_nth(self.state.config.validation_every_nth);
-        self.run_on(&Arc::new(learned), &held_out, mixture, Poses::Fresh, watcher)
+        let parts = self.state.config.parts;
+        let parts = learned.in_parts(parts).into_iter().zip(held_out.in_parts(parts));
+        let parts: Vec<Part> = parts
+            .map(|(shapes, held_out)| Part { shapes: Arc::new(shapes), held_out: Arc::new(held_out) })
+            .collect();
+        self.run_on(&parts, mixture, Poses::Fresh, &mut Alone, watcher)
     }
 
-    /// The same with given sets.
+    /// The same with given shapes: those of the parts that are the team's member's own.
     ///
     /// # Errors
-    /// As [`Self::run`].
+    /// As [`Self::run`], and where a member of the team is lost.
     pub fn run_on(
         &mut self,
-        shapes: &Arc<Shapes>,
-        held_out: &Shapes,
+        parts: &[Part],
         mixture: &Mixture,
         poses: Poses,
+        team: &mut dyn Team,
         watcher: &mut dyn Watcher,
     ) -> Result<bool> {
         let config = self.state.config.clone();
-        let lengths: Vec<u64> = config.stages.iter().map(|stage| stage.steps(shapes.len())).collect();
+        let shapes = team.gather(parts.iter().map(|part| vec![part.shapes.len() as f64]).collect())?;
+        let shapes = shapes.iter().flatten().sum::<f64>() as usize;
+        let lengths: Vec<u64> = config.stages.iter().map(|stage| stage.steps(shapes)).collect();
         let steps = lengths.iter().sum();
         let mut before = 0;
         for ((index, stage), length) in config.stages.iter().enumerate().zip(&lengths) {
@@ -214,9 +248,7 @@ impl Trainer {
                     .map(|(stage, steps)| steps * 2 * stage.batch as u64)
                     .sum();
                 let place = Place { index, stage, poses, first: before, end, steps, later };
-                let seen = stage.network(&config.network);
-                let validation = Validation::new(held_out, mixture, stage.points, &seen)?;
-                if !self.stage(shapes, &validation, mixture, &place, watcher)? {
+                if !self.stage(parts, mixture, &place, team, watcher)? {
                     self.save()?;
                     return Ok(false);
                 }
@@ -229,33 +261,41 @@ impl Trainer {
 
     fn stage(
         &mut self,
-        shapes: &Arc<Shapes>,
-        validation: &Validation,
+        parts: &[Part],
         mixture: &Mixture,
         place: &Place,
+        team: &mut dyn Team,
         watcher: &mut dyn Watcher,
     ) -> Result<bool> {
         let config = self.state.config.clone();
-        let per_epoch = place.stage.steps_per_epoch(shapes.len());
-        let done = self.state.step - place.first;
-        let plan = Plan::Training(Training {
-            mixture: mixture.clone(),
-            points: place.stage.points,
-            poses: place.poses,
-            seed: random::fnv1a(&format!("{} stage {}", config.seed, place.index)),
-            from: Position { epoch: done / per_epoch, batch: done % per_epoch },
-        });
         let seen = place.stage.network(&config.network);
-        let prepare = move |example: &Example| seen.input(example.source.clone(), example.target.clone());
-        let mut batches = Loader::start(shapes, &plan, place.stage.batch, LOADER_THREADS, prepare)?;
+        let mut loaders = Vec::new();
+        let mut validations = Vec::new();
+        for (part, index) in parts.iter().zip(team.own(config.parts)) {
+            let plan = Plan::Training(Training {
+                mixture: mixture.clone(),
+                points: place.stage.points,
+                poses: place.poses,
+                seed: config.seed_of(&format!("stage {}", place.index), index),
+                // Counted from the stage's start: parts of a few shapes more have longer epochs.
+                from: Position { epoch: 0, batch: self.state.step - place.first },
+            });
+            let seen_by = seen.clone();
+            let prepare =
+                move |example: &Example| seen_by.input(example.source.clone(), example.target.clone());
+            let batch = share(place.stage.batch, index, config.parts).len();
+            loaders.push(Loader::start(&part.shapes, &plan, batch, LOADER_THREADS, prepare)?);
+            validations.push(Validation::new(&part.held_out, mixture, place.stage.points, &seen)?);
+        }
         let mut since = Since::default();
         let mut saved = Instant::now();
         while self.state.step < place.end {
             let start = Instant::now();
-            let Some(batch) = batches.next().transpose()? else { break };
-            let batch = Batch::new(batch.prepared, batch.T_target_source);
+            let batches = loaders.iter_mut().map_while(Iterator::next);
+            let batches = batches.map(|batch| batch.map(|b| Batch::new(b.prepared, b.T_target_source)));
+            let batches = batches.collect::<Result<Vec<_>>>()?;
             let rate = config.step_size(self.state.step, place.steps);
-            let loss = self.step(&batch, rate)?;
+            let loss = self.step(&batches, rate, team)?;
             self.state.step += 1;
             since.loss += loss;
             since.steps += 1;
@@ -270,9 +310,11 @@ impl Trainer {
                     steps: place.steps,
                     points: place.stage.points,
                     loss: since.loss / since.steps as f64,
-                    validation: (validates && !validation.batches.is_empty())
-                        .then(|| validate(&self.network, validation))
-                        .transpose()?,
+                    validation: if validates {
+                        validate_together(&self.network, &validations, team)?
+                    } else {
+                        None
+                    },
                     learning_rate: rate,
                     clouds_per_second: (since.steps * 2 * place.stage.batch) as f64 / since.seconds,
                     seconds: self.state.seconds,
@@ -295,21 +337,33 @@ impl Trainer {
         Ok(true)
     }
 
-    /// One step of Adam on a batch; its mean loss.
+    /// One step of Adam on a batch, of which the team's member has these parts; its mean loss.
     ///
     /// # Errors
-    /// Where the loss is not finite, or the batch was made for another network.
-    pub fn step(&mut self, batch: &Batch, rate: f64) -> Result<f64> {
-        let seed = random::fnv1a(&format!("{} step {}", self.state.config.seed, self.state.step));
-        let (loss, statistics) = self.network.learn(batch, seed)?;
-        let value = f64::from(loss.clone().into_scalar::<f32>());
-        if !value.is_finite() {
-            return Err(Error::Diverged { step: self.state.step });
+    /// Where the loss is not finite, the batch was made for another network, or a member of the team is lost.
+    pub fn step(&mut self, batches: &[Batch], rate: f64, team: &mut dyn Team) -> Result<f64> {
+        let step = self.state.step;
+        let mut rows = Vec::new();
+        let mut lesson = None;
+        for (batch, part) in batches.iter().zip(team.own(self.state.config.parts)) {
+            let seed = self.state.config.seed_of(&format!("step {step}"), part);
+            let (loss, statistics) = self.network.learn(batch, seed)?;
+            let value = f64::from(loss.clone().into_scalar::<f32>());
+            let gradients = GradientsParams::from_grads(loss.backward(), &self.network);
+            let own = Lesson { loss: value, gradients, statistics };
+            rows.push(own.to_row(batch.truths().len(), &self.network));
+            lesson = Some(own);
         }
-        let gradients = GradientsParams::from_grads(loss.backward(), &self.network);
-        let network = self.optimizer.step(rate, self.network.clone(), gradients);
-        self.network = network.observed(&statistics, STATISTICS_SHARE);
-        Ok(value)
+        let (_, mean) = mean(team, rows)?;
+        let Some(lesson) = lesson.map(|own| own.filled(&mean, &self.network)).transpose()? else {
+            return Err(Error::InvalidSetting { name: "team", reason: "a member has no part".into() });
+        };
+        if !lesson.loss.is_finite() {
+            return Err(Error::Diverged { step });
+        }
+        let network = self.optimizer.step(rate, self.network.clone(), lesson.gradients);
+        self.network = network.observed(&lesson.statistics, STATISTICS_SHARE);
+        Ok(lesson.loss)
     }
 
     /// Writes the checkpoint.
@@ -351,13 +405,9 @@ impl Stage {
         config.with_neighbors(self.k)
     }
 
-    fn steps_per_epoch(&self, shapes: usize) -> u64 {
-        (shapes / self.batch).max(1) as u64
-    }
-
     fn steps(&self, shapes: usize) -> u64 {
         match self.length {
-            Length::Epochs(epochs) => epochs * self.steps_per_epoch(shapes),
+            Length::Epochs(epochs) => epochs * (shapes / self.batch).max(1) as u64,
             Length::Steps(steps) => steps,
         }
     }
