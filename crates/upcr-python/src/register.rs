@@ -137,11 +137,20 @@ pub fn register_batch<'py>(
         inputs.insert(place, input.clone());
         Ok(input)
     };
-    let pairs = pairs.into_iter().map(|(source, target, init)| {
-        let init = init.map(|init| pose("init", &init)).transpose()?;
-        Ok(Pair { source: input(source)?, target: input(target)?, init })
-    });
-    let pairs = Arc::new(pairs.collect::<PyResult<Vec<_>>>()?);
+    let mut ready = Vec::new();
+    // Why a pair cannot be looked at, where it cannot.
+    let mut refused = Vec::new();
+    for (source, target, init) in pairs {
+        match init.map(|init| pose("init", &init)).transpose() {
+            Ok(init) => {
+                ready.push(Pair { source: input(source)?, target: input(target)?, init });
+                refused.push(None);
+            }
+            Err(error) if raises => return Err(error),
+            Err(error) => refused.push(Some(error)),
+        }
+    }
+    let pairs = Arc::new(ready);
     let threads = settings
         .threads
         .map_or_else(|| pool(py).map(rayon::ThreadPool::current_num_threads), |n| Ok(n.get()))?;
@@ -153,7 +162,13 @@ pub fn register_batch<'py>(
     };
     let found = run(py, Place::Thread, move |caller| batch.run(caller), hear)??;
     let results = PyList::empty(py);
-    for (found, pair) in found.into_iter().zip(pairs.iter()) {
+    let mut found = found.into_iter().zip(pairs.iter());
+    for error in refused {
+        if let Some(error) = error {
+            results.append(error.into_value(py))?;
+            continue;
+        }
+        let Some((found, pair)) = found.next() else { break };
         match found {
             Some(Ok(found)) => results.append(found.into_parts(py)?)?,
             Some(Err(error)) => {

@@ -45,13 +45,17 @@ fn shape(cloud: &PointCloud, index: usize) -> Result<Vec<[f32; 3]>> {
 }
 
 impl Shapes {
-    /// Clouds in memory as shapes of one category: those that a folder gives that holds them in this order.
+    /// Clouds in memory as shapes of one category: those that a folder gives that holds them in this order, after `before`
+    /// others.
     ///
     /// # Errors
     /// Where a cloud has no two different points that are finite.
-    pub fn from_clouds(clouds: &[PointCloud]) -> Result<Self> {
-        let shapes: Vec<_> =
-            clouds.par_iter().enumerate().map(|(i, cloud)| shape(cloud, i)).collect::<Result<_>>()?;
+    pub fn from_clouds(clouds: &[PointCloud], before: usize) -> Result<Self> {
+        let shapes: Vec<_> = clouds
+            .par_iter()
+            .enumerate()
+            .map(|(i, cloud)| shape(cloud, before + i))
+            .collect::<Result<_>>()?;
         Ok(Self { labels: vec![0; shapes.len()], clouds: shapes, names: vec!["shapes".into()] })
     }
 }
@@ -101,7 +105,8 @@ mod tests {
         let read: Vec<PointCloud> =
             files(folder.path()).unwrap().iter().map(|path| io::read_cloud(path).unwrap()).collect();
         let whole = data::open(folder.path(), Split::All).unwrap();
-        assert_eq!(Shapes::from_clouds(&read).unwrap().clouds, whole.clouds);
+        assert_eq!(Shapes::from_clouds(&read, 0).unwrap().clouds, whole.clouds);
+        assert_eq!(Shapes::from_clouds(&read[2..], 2).unwrap().clouds, whole.clouds[2..]);
         let mut along: Vec<f32> =
             data::open(folder.path(), Split::All).unwrap().clouds[0].iter().map(|p| p[0]).collect();
         along.sort_by(f32::total_cmp);

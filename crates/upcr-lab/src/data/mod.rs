@@ -138,15 +138,23 @@ impl Shapes {
         (part(false), part(true))
     }
 
+    /// Takes the shapes from `length` on, where there are any, into a set of their own.
+    #[must_use]
+    pub fn split_off(&mut self, length: usize) -> Self {
+        let length = length.min(self.len());
+        Self {
+            clouds: self.clouds.split_off(length),
+            labels: self.labels.split_off(length),
+            names: self.names.clone(),
+        }
+    }
+
     /// So many sets of consecutive shapes, as even as it goes.
-    pub fn in_parts(&self, parts: usize) -> Vec<Self> {
+    pub fn in_parts(mut self, parts: usize) -> Vec<Self> {
+        let length = self.len();
         let part = |index| {
-            let range = share(self.len(), index, parts);
-            Self {
-                clouds: self.clouds[range.clone()].to_vec(),
-                labels: self.labels[range].to_vec(),
-                names: self.names.clone(),
-            }
+            let later = self.split_off(share(length, index, parts).len());
+            std::mem::replace(&mut self, later)
         };
         (0..parts).map(part).collect()
     }

@@ -84,6 +84,7 @@ def adapt(
     fixed_pairs: bool = False,
     seed: int | None = None,
     threads: int | None = None,
+    parts: int = 1,
     folder: str | os.PathLike[str] | None = None,
     progress: Callable[[AdaptationProgress], object] | None = None,
 ) -> Adaptation:
@@ -100,6 +101,8 @@ def adapt(
         fixed_pairs: Learn from one pair of each cloud, not from new poses in every epoch.
         seed: Seed of the pairs.
         threads: Threads to use; else all. The result does not depend on it.
+        parts: Parts of every batch, each of which normalises itself, as machines have them that learn together
+            (:func:`upcr.ray.adapt`).
         folder: Where the run's checkpoint and learning curve go; a run that was stopped there goes on. Else nowhere.
         progress: Called now and then, on this thread. What it raises ends the call, as does Ctrl-C.
 
@@ -121,6 +124,8 @@ def adapt(
         "learning_rate": learning_rate,
         "seed": seed,
         "threads": threads,
+        "parts": parts,
+        "checkpoint_seconds": None,
     }
 
     def hear(event: dict[str, Any]) -> None:
@@ -135,6 +140,6 @@ def adapt(
         else:
             place = os.fspath(folder)
             os.makedirs(place, exist_ok=True)
-        found = _upcr.adapt(given, weights._native, place, options, hear)
+        found = _upcr.adapt(given, weights._native, place, options, hear, None)
     before, after = Errors(**found.pop("before")), Errors(**found.pop("after"))
     return Adaptation(model=Model(found.pop("model")), before=before, after=after, **found)

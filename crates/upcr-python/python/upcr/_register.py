@@ -155,18 +155,34 @@ def register_batch(
     if errors not in ("raise", "return"):
         raise _upcr.SettingError(f"setting `errors`: there is no {errors}; there are raise, return")
     clouds: list[Any] = []
-    places: dict[int, int] = {}
+    places: dict[int, int | Exception] = {}
+    # A cloud's identity lasts as long as the cloud.
+    held = []
 
     def place_of(cloud: CloudLike) -> int:
         if id(cloud) not in places:
-            places[id(cloud)] = len(clouds)
-            clouds.append(cloud)
-        return places[id(cloud)]
+            held.append(cloud)
+            try:
+                clouds.append(packed(cloud))
+                places[id(cloud)] = len(clouds) - 1
+            except (TypeError, ValueError) as error:
+                places[id(cloud)] = error
+        known = places[id(cloud)]
+        if isinstance(known, Exception):
+            raise known
+        return known
 
     wanted = []
-    for source, target, *init in pairs:
-        guess = None if not init or init[0] is None else _settings.pose(init[0])
-        wanted.append((place_of(source), place_of(target), guess))
+    refused: dict[int, Exception] = {}
+    for i, (source, target, *init) in enumerate(pairs):
+        try:
+            guess = None if not init or init[0] is None else _settings.pose(init[0])
+            wanted.append((place_of(source), place_of(target), guess))
+        except (TypeError, ValueError) as error:
+            if errors == "raise":
+                raise
+            refused[i] = error
     given = _settings.packed(settings)
-    found = _upcr.register_batch([packed(cloud) for cloud in clouds], wanted, given, errors == "raise", progress)
-    return [one if isinstance(one, Exception) else registration(one) for one in found]
+    found = iter(_upcr.register_batch(clouds, wanted, given, errors == "raise", progress))
+    answers = [refused[i] if i in refused else next(found) for i in range(len(wanted) + len(refused))]
+    return [one if isinstance(one, Exception) else registration(one) for one in answers]

@@ -98,5 +98,6 @@ def adapt(
     folder: str,
     options: dict[str, Any],
     progress: Callable[[dict[str, Any]], object] | None,
+    member: dict[str, Any] | None,
 ) -> dict[str, Any]: ...
 def main(args: Sequence[str]) -> int: ...
