@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use numpy::{Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
+use pyo3::types::PyString;
 use upcr::io::{self, ReadOptions};
 use upcr::{CloudRole, PointCloud};
 
@@ -31,8 +32,8 @@ impl FromPyObject<'_, '_> for Input {
     type Error = PyErr;
 
     fn extract(object: Borrowed<'_, '_, PyAny>) -> PyResult<Self> {
-        if let Ok(path) = object.extract::<PathBuf>() {
-            return Ok(Self::File(path));
+        if object.is_instance_of::<PyString>() {
+            return Ok(Self::File(object.extract()?));
         }
         let (points, normals, colors, viewpoint) = object.extract::<Arrays>()?;
         let points = rows("points", &points)?;

@@ -8,11 +8,16 @@ use serde_json::{Value, to_value};
 
 /// A structure as a dictionary.
 pub fn dictionary<'py>(py: Python<'py>, value: &impl serde::Serialize) -> PyResult<Bound<'py, PyDict>> {
-    let value = to_value(value).map_err(|error| PyRuntimeError::new_err(error.to_string()))?;
-    Ok(object(py, &value)?.cast_into::<PyDict>()?)
+    Ok(object(py, value)?.cast_into::<PyDict>()?)
 }
 
-fn object<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
+/// Anything.
+pub fn object<'py>(py: Python<'py>, value: &impl serde::Serialize) -> PyResult<Bound<'py, PyAny>> {
+    let value = to_value(value).map_err(|error| PyRuntimeError::new_err(error.to_string()))?;
+    from_json(py, &value)
+}
+
+fn from_json<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
     match value {
         Value::Null => Ok(py.None().into_bound(py)),
         Value::Bool(value) => value.into_bound_py_any(py),
@@ -23,13 +28,13 @@ fn object<'py>(py: Python<'py>, value: &Value) -> PyResult<Bound<'py, PyAny>> {
         },
         Value::String(text) => text.into_bound_py_any(py),
         Value::Array(values) => {
-            let values: Vec<_> = values.iter().map(|value| object(py, value)).collect::<PyResult<_>>()?;
+            let values: Vec<_> = values.iter().map(|value| from_json(py, value)).collect::<PyResult<_>>()?;
             Ok(PyList::new(py, values)?.into_any())
         }
         Value::Object(fields) => {
             let dict = PyDict::new(py);
             for (name, value) in fields {
-                dict.set_item(name, object(py, value)?)?;
+                dict.set_item(name, from_json(py, value)?)?;
             }
             Ok(dict.into_any())
         }

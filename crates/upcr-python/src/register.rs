@@ -7,49 +7,84 @@ use std::thread;
 
 use numpy::PyArray2;
 use pyo3::exceptions::PyIndexError;
+use pyo3::intern;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
-use upcr::{PointCloud, Progress, Registration, Rigid, Settings, Watch, register_watched};
+use serde::Serialize;
+use upcr::{
+    Alternative, Evidence, FreeDirection, PointCloud, Progress, Registration, Rigid, Settings, Timings,
+    Watch, register_watched,
+};
 
 use crate::call::{Caller, Place, own_pool, pool, run};
 use crate::cloud::{Input, array, cloud_exception, viewpoint};
-use crate::objects::dictionary;
+use crate::objects::{dictionary, object};
 use crate::settings::{pose, settings};
 
 /// Points of a cloud that a result keeps for its picture, at most.
 const PICTURED: usize = 600;
 
-/// A result with points of both clouds for its picture.
+/// A result with what Python is given of it beside its numbers.
 struct Found {
     registration: Registration,
+    more: String,
+    /// Points of the source and of the target.
     pictured: [Vec<[f64; 3]>; 2],
 }
 
-/// What Python makes a result of: its fields, and points of the source and the target.
-type Parts<'py> = (Bound<'py, PyDict>, Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>);
+/// What Python makes a result of: its fields, the JSON of those that few look at, and points of the source and the target.
+type Parts<'py> = (Bound<'py, PyDict>, String, Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>);
+
+/// The fields that cost more to make than the call has over, and are made where they are looked at.
+#[derive(Serialize)]
+struct More<'a> {
+    caveats: Vec<String>,
+    free_directions: &'a [FreeDirection],
+    /// The free directions in words.
+    sentences: Vec<String>,
+    alternatives: &'a [Alternative],
+    evidence: &'a Evidence,
+    points_used: [usize; 2],
+    settings: &'a Settings,
+    timings_ms: &'a Timings,
+}
 
 impl Found {
     fn new(registration: Registration, source: &PointCloud, target: &PointCloud) -> Self {
-        Self { registration, pictured: [source, target].map(spread) }
+        let more = More {
+            caveats: registration.reasons.iter().map(ToString::to_string).collect(),
+            free_directions: &registration.free_directions,
+            sentences: registration.free_directions.iter().map(ToString::to_string).collect(),
+            alternatives: &registration.alternatives,
+            evidence: &registration.evidence,
+            points_used: registration.points_used,
+            settings: &registration.settings,
+            timings_ms: &registration.timings_ms,
+        };
+        // Names, numbers and lists of them all have a JSON form.
+        let more = serde_json::to_string(&more).unwrap_or_default();
+        Self { registration, more, pictured: [source, target].map(spread) }
     }
 
     fn into_parts(self, py: Python<'_>) -> PyResult<Parts<'_>> {
-        let Self { registration, pictured: [source, target] } = self;
-        let fields = dictionary(py, &registration)?;
-        fields.set_item("is_trustworthy", registration.is_trustworthy())?;
-        let caveats: Vec<String> = registration.reasons.iter().map(ToString::to_string).collect();
-        fields.set_item("caveats", caveats)?;
-        for (field, direction) in
-            fields_of(&fields, "free_directions")?.iter().zip(&registration.free_directions)
-        {
-            field.set_item("sentence", direction.to_string())?;
-        }
-        Ok((fields, array(py, source)?, array(py, target)?))
+        let Self { registration: found, more, pictured: [source, target] } = self;
+        let fields = PyDict::new(py);
+        let pose = array(py, found.T_target_source.to_rows().to_vec())?;
+        fields.set_item(intern!(py, "T_target_source"), pose)?;
+        fields.set_item(intern!(py, "fitness"), found.fitness)?;
+        fields.set_item(intern!(py, "inlier_rmse"), found.inlier_rmse)?;
+        fields.set_item(intern!(py, "num_inliers"), found.num_inliers)?;
+        fields.set_item(intern!(py, "converged"), found.converged)?;
+        fields.set_item(intern!(py, "iterations"), found.iterations)?;
+        fields.set_item(intern!(py, "probability"), found.probability)?;
+        fields.set_item(intern!(py, "covariance"), array(py, found.covariance.to_vec())?)?;
+        fields.set_item(intern!(py, "reasons"), object(py, &found.reasons)?)?;
+        fields.set_item(intern!(py, "source_scale"), found.source_scale)?;
+        fields.set_item(intern!(py, "method"), object(py, &found.method)?)?;
+        fields.set_item(intern!(py, "voxel_size"), found.voxel_size)?;
+        fields.set_item(intern!(py, "is_trustworthy"), found.is_trustworthy())?;
+        Ok((fields, more, array(py, source)?, array(py, target)?))
     }
-}
-
-fn fields_of<'py>(fields: &Bound<'py, PyDict>, name: &str) -> PyResult<Bound<'py, PyList>> {
-    Ok(fields.as_any().get_item(name)?.cast_into::<PyList>()?)
 }
 
 /// Points from all over a cloud: of every so many in its order one, at changing places, as scanners' orders have periods.
@@ -106,10 +141,12 @@ struct Pair {
 
 impl Pair {
     fn register(&self, settings: &Settings, gone: &(dyn Fn() -> bool + Sync)) -> upcr::Result<Found> {
+        let told = settings.threads;
         let settings = Settings { init: self.init.or(settings.init), threads: None, ..settings.clone() };
         let (source, target) = (self.source.get()?, self.target.get()?);
         let watch = Watch { cancelled: Some(gone), progress: None };
-        let registration = register_watched(&source, &target, &settings, &watch)?;
+        let mut registration = register_watched(&source, &target, &settings, &watch)?;
+        registration.settings.threads = told;
         Ok(Found::new(registration, &source, &target))
     }
 }
@@ -210,13 +247,9 @@ impl Batch {
                 if i > first_failed.load(Ordering::Relaxed) {
                     break;
                 }
-                let mut one = pair.register(&settings, &is_gone);
-                match &mut one {
-                    Ok(found) => found.registration.settings.threads = settings.threads,
-                    Err(_) if raises => {
-                        first_failed.fetch_min(i, Ordering::Relaxed);
-                    }
-                    Err(_) => {}
+                let one = pair.register(&settings, &is_gone);
+                if one.is_err() && raises {
+                    first_failed.fetch_min(i, Ordering::Relaxed);
                 }
                 found.lock().unwrap_or_else(PoisonError::into_inner)[i] = Some(one);
                 caller.tell(());

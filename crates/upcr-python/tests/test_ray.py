@@ -210,7 +210,7 @@ def test_learning_goes_on_where_a_worker_died(tmp_path: Path) -> None:
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     together = upcr.ray.adapt(
-        dataset, workers=2, name="run", storage_path=str(tmp_path), checkpoint_seconds=0.5, **settings
+        dataset, workers=2, name="run", storage_path=str(tmp_path), checkpoint_seconds=1.5, **settings
     )  # type: ignore[arg-type]
     alone = upcr.adapt(clouds, parts=2, **settings)  # type: ignore[arg-type]
     assert len(killed) == 1

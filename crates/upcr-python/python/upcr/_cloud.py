@@ -166,6 +166,8 @@ def place(viewpoint: npt.ArrayLike | None) -> tuple[float, float, float] | None:
 
 def _rows(values: Any, dtype: npt.DTypeLike, name: str) -> npt.NDArray[Any]:
     array = np.asarray(values)
+    if array.dtype == dtype and array.ndim == 2 and array.shape[1] == 3 and array.flags.c_contiguous and array.flags.aligned:
+        return array
     if array.dtype.kind not in "fiu":
         raise TypeError(f"{name}: numbers are needed, not {array.dtype}")
     if array.ndim != 2 or array.shape[1] != 3:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from ._cloud import FloatArray
+
+if TYPE_CHECKING:
+    from ._upcr import _Parts
 
 Reason = Literal[
     "no_overlap",
@@ -137,31 +142,67 @@ class Registration:
     covariance: FloatArray
     """Shape (6, 6), rad² and squared units of the clouds, of the left twist (rotation, then translation) about the centre
     of the target's bounding box that takes the pose found to the right one, axes as in the target's frame."""
-    free_directions: list[FreeDirection]
-    """Motions that the geometry does not hold."""
     reasons: list[Reason]
     """What speaks against the pose."""
-    alternatives: list[Alternative]
-    """Other poses that explain the clouds nearly as well, best first."""
     source_scale: float | None
     """The factor by which the source's lengths have to be multiplied for the clouds to fit, where they do not as they are."""
-    evidence: Evidence
-    """What the probability is made of."""
     method: str
     """Which source the winning first pose came from."""
     voxel_size: float
     """The scale used, in the clouds' unit; 0 where the call ended before it was known."""
-    points_used: tuple[int, int]
-    """Points of source and target that were looked at."""
-    settings: dict[str, Any]
-    """All settings in effect."""
-    timings_ms: Timings
-    """Where the time went."""
     is_trustworthy: bool
     """Whether the pose is more likely right than wrong."""
-    caveats: list[str]
-    """The reasons in words."""
+    _more: str = field(repr=False)
     _pictured: tuple[FloatArray, FloatArray] = field(repr=False)
+
+    @cached_property
+    def caveats(self) -> list[str]:
+        """The reasons in words."""
+        return list(self._told["caveats"])
+
+    @cached_property
+    def free_directions(self) -> list[FreeDirection]:
+        """Motions that the geometry does not hold."""
+        return [
+            FreeDirection(one["motion"], np.array(one["axis"]), np.array(one["point"]) if "point" in one else None, sentence)
+            for one, sentence in zip(self._told["free_directions"], self._told["sentences"], strict=True)
+        ]
+
+    @cached_property
+    def alternatives(self) -> list[Alternative]:
+        """Other poses that explain the clouds nearly as well, best first."""
+        return [
+            Alternative(np.array(one["T_target_source"]), one["relative_score"]) for one in self._told["alternatives"]
+        ]
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """What the probability is made of."""
+        evidence = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in self._told["evidence"].items()
+        }
+        return Evidence(**evidence)
+
+    @cached_property
+    def points_used(self) -> tuple[int, int]:
+        """Points of source and target that were looked at."""
+        source, target = self._told["points_used"]
+        return source, target
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """All settings in effect."""
+        return dict(self._told["settings"])
+
+    @cached_property
+    def timings_ms(self) -> Timings:
+        """Where the time went."""
+        return Timings(**self._told["timings_ms"])
+
+    @cached_property
+    def _told(self) -> dict[str, Any]:
+        told: dict[str, Any] = json.loads(self._more)
+        return told
 
     @property
     def transformation(self) -> FloatArray:
@@ -206,24 +247,7 @@ class Registration:
         return lines
 
 
-def registration(parts: tuple[dict[str, Any], FloatArray, FloatArray]) -> Registration:
+def registration(parts: _Parts) -> Registration:
     """A result from what the native half gives."""
-    fields, *pictured = parts
-    array = np.array
-    for name in ("T_target_source", "covariance"):
-        fields[name] = array(fields[name])
-    fields["free_directions"] = [
-        FreeDirection(one["motion"], array(one["axis"]), array(one["point"]) if "point" in one else None, one["sentence"])
-        for one in fields["free_directions"]
-    ]
-    fields["alternatives"] = [
-        Alternative(array(one["T_target_source"]), one["relative_score"]) for one in fields["alternatives"]
-    ]
-    evidence = fields["evidence"]
-    for name in ("overlap", "facing", "matches"):
-        if evidence[name] is not None:
-            evidence[name] = tuple(evidence[name])
-    fields["evidence"] = Evidence(**evidence)
-    fields["points_used"] = tuple(fields["points_used"])
-    fields["timings_ms"] = Timings(**fields["timings_ms"])
-    return Registration(**fields, _pictured=(pictured[0], pictured[1]))
+    fields, more, source, target = parts
+    return Registration(**fields, _more=more, _pictured=(source, target))

@@ -11,7 +11,7 @@ _Arrays: TypeAlias = tuple[
     _Floats, npt.NDArray[np.float32] | None, npt.NDArray[np.uint8] | None, tuple[float, float, float] | None
 ]
 _Packed: TypeAlias = str | _Arrays
-_Parts: TypeAlias = tuple[dict[str, Any], _Floats, _Floats]
+_Parts: TypeAlias = tuple[dict[str, Any], str, _Floats, _Floats]
 _Place: TypeAlias = tuple[float, float, float] | None
 
 __all__ = [
