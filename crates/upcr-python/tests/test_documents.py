@@ -5,10 +5,10 @@ In a page of the guide every fenced block is one of these, and is run or checked
 - ``python``: run in order, in one namespace a page. Where Open3D cannot be imported, blocks that name it are left out.
 - ``sh``: run by bash, ended by the first command that fails. A last line ``... # exit status 3`` says how.
 - ``output``: what the block before it prints: words alike, numbers nearly, ``…`` standing for anything.
-- ``text``, ``console``: not run.
+- ``text``, ``console``: not run; nor ``{eval-rst}``, which is Sphinx's to check.
 
-Of the READMEs the ``python`` blocks are run. Each page has a folder of its own with the sample pair, and ``my-scans`` with a
-few clouds. Learning and fitting, which take minutes to hours, are cut short.
+Of the READMEs the ``python`` blocks are run. Each page has a folder of its own with the sample pair, ``my-scans`` with a
+few clouds, and ``depth.png``, a wall at 1.5 m. Learning and fitting, which take minutes to hours, are cut short.
 """
 
 import contextlib
@@ -16,14 +16,18 @@ import io
 import os
 import re
 import shutil
+import struct
 import subprocess
 import sysconfig
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 from conftest import ROOT, SAMPLES, bumpy
 
@@ -31,7 +35,7 @@ import upcr
 
 READMES = [ROOT / "README.md", ROOT / "crates/upcr-python/README.md"]
 PAGES = [page for page in sorted((ROOT / "docs/guide").glob("*.md")) if "```" in page.read_text(encoding="utf-8")]
-LANGUAGES = {"python", "sh", "output", "text", "console"}
+LANGUAGES = {"python", "sh", "output", "text", "console", "{eval-rst}"}
 SHORT = {"epochs": 1, "points": 64}
 SHORT_COMMANDS = {"upcr adapt ": "--epochs 1 --points 64 ", "upcr calibrate fit ": "--pairs 30 --scenes 0 "}
 LEFT_OUT = "left out"
@@ -70,11 +74,23 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "my-scans").mkdir()
     for i in range(3):
         upcr.write(tmp_path / "my-scans" / f"{i}.ply", bumpy(300, i))
+    depth = np.full((60, 80), 1500, ">u2")  # millimetres
+    (tmp_path / "depth.png").write_bytes(png(depth))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", sysconfig.get_path("scripts") + os.pathsep + os.environ["PATH"])
     adapt = upcr.adapt
     monkeypatch.setattr(upcr, "adapt", lambda *given, **options: adapt(*given, **{**options, **SHORT}))
     return tmp_path
+
+
+def png(grey: npt.NDArray[np.uint16]) -> bytes:
+    """A PNG file of big-endian 16-bit grey values, rows and columns."""
+    height, width = grey.shape
+    rows = b"".join(b"\0" + row.tobytes() for row in grey)  # none of them filtered
+    chunks = (b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)), (b"IDAT", zlib.compress(rows)), (b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
 
 
 def run_python(block: Block, namespace: dict[str, Any]) -> str:
