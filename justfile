@@ -18,6 +18,12 @@ test:
 python *args:
     crates/upcr-python/test {{ args }}
 
+# Build the guide into target/guide, and for its reference the Python package
+guide:
+    python3 -m venv target/guide-venv
+    target/guide-venv/bin/pip install --quiet --requirement docs/guide/requirements.txt ./crates/upcr-python
+    target/guide-venv/bin/python -m sphinx --fail-on-warning --quiet -c docs/guide docs target/guide
+
 # Format the code
 fmt:
     cargo fmt

@@ -22,7 +22,10 @@ root_doc = "guide/index"
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 nitpicky = True
 # Types of other packages, whose references are not at hand without a network, and names that speak for themselves.
-nitpick_ignore_regex = [("py:.*", r"(numpy|npt|os|collections)\..*|CloudLike|FloatArray|Pair|Method|Feature|Refinement|Kernel")]
+nitpick_ignore_regex = [
+    ("py:class", r"(numpy|npt|os|collections|typing)\..*|NDArray|Unpack"),
+    ("py:class", "CloudLike|FloatArray|Pair|Method|Feature|Refinement|Kernel"),
+]
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
@@ -37,6 +40,7 @@ autodoc_type_aliases = {name: name for name in ("CloudLike", "FloatArray", "npt.
 html_theme = "furo"
 html_title = f"UPCR {release}"
 html_copy_source = False
+html_show_copyright = False
 html_show_sphinx = False
 
 
