@@ -37,6 +37,22 @@ def test_arrays_are_taken_over_or_converted(blob: Points) -> None:
         upcr.PointCloud(blob, blob[:, :2])
 
 
+def test_colors(blob: Points) -> None:
+    shares = np.linspace(0, 1, 3 * len(blob)).reshape(-1, 3)
+    for colors in (shares, shares.astype(np.float32), np.rint(255 * shares).astype(int)):
+        assert np.array_equal(upcr.PointCloud(blob, colors=colors).colors, np.rint(255 * shares))  # type: ignore[arg-type]
+    for colors, message in (
+        (255 * shares, "shares from 0 to 1"),
+        (shares - 0.1, "shares"),
+        (shares * np.nan, "shares"),
+        (np.full(blob.shape, 256), "whole numbers from 0 to 255"),
+        (np.full(blob.shape, -1), "whole"),
+        (shares[:, 0], "shape"),
+    ):
+        with pytest.raises(upcr.CloudError, match=f"colors: .*{message}"):
+            upcr.PointCloud(blob, colors=colors)
+
+
 @pytest.mark.parametrize("name", ["a.ply", "a.pcd", "a.xyz", "a.npy", "a.las", "a.laz", "a.e57", "a.bin"])
 def test_files(blob: Points, tmp_path: Path, name: str) -> None:
     upcr.write(tmp_path / name, upcr.PointCloud(blob))
@@ -95,6 +111,10 @@ def test_a_moved_cloud(blob: Points) -> None:
     assert np.allclose(moved.normals, cloud.normals @ turn(40).T, atol=1e-6)
     assert moved.viewpoint is not None and np.allclose(moved.viewpoint, turn(40) @ (1, 2, 3) + (1, 2, 3))
     assert equal(cloud, full(blob))
+    with pytest.raises(upcr.SettingError, match=r"`pose`: a 4x4 matrix is needed, not one of shape \[3, 3\]"):
+        cloud.transformed(turn(40))
+    with pytest.raises(upcr.SettingError, match="`viewpoint`: three coordinates"):
+        upcr.PointCloud(blob, viewpoint=(1, 2))
 
 
 def test_open3d(blob: Points, tmp_path: Path) -> None:

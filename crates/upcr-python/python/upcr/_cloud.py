@@ -52,15 +52,18 @@ class PointCloud:
         colors: npt.ArrayLike | None = None,
         viewpoint: npt.ArrayLike | None = None,
     ) -> None:
-        """Takes over arrays that are of the attributes' types already, and converts all others."""
+        """Takes over arrays that are of the attributes' types already, and converts all others: colors that are not whole
+        numbers are shares, 0 to 1."""
         self.points = _rows(points, np.float64, "points")
         self.normals = None if normals is None else _rows(normals, np.float32, "normals")
-        self.colors = None if colors is None else _rows(colors, np.uint8, "colors")
-        self.viewpoint = None if viewpoint is None else np.array(viewpoint, np.float64).reshape(3)
+        self.colors = None if colors is None else _bytes(colors)
+        self.viewpoint = None if viewpoint is None else np.array(place(viewpoint))
 
     def transformed(self, pose: npt.ArrayLike) -> PointCloud:
         """The cloud moved by ``pose``, shape (4, 4): points and viewpoint as points, normals as directions."""
         matrix = np.asarray(pose, np.float64)
+        if matrix.shape != (4, 4):
+            raise _upcr.SettingError(f"setting `pose`: a 4x4 matrix is needed, not one of shape {list(matrix.shape)}")
         rotation, translation = matrix[:3, :3], matrix[:3, 3]
         return PointCloud(
             self.points @ rotation.T + translation,
@@ -183,8 +186,14 @@ def _rows_of(cloud: Any, name: str, dtype: npt.DTypeLike) -> npt.NDArray[Any] | 
 
 def _colors(cloud: Any) -> npt.NDArray[np.uint8] | None:
     values = getattr(cloud, "colors", None)
-    if values is None or len(values) == 0:
-        return None
+    return None if values is None or len(values) == 0 else _bytes(values)
+
+
+def _bytes(values: Any) -> npt.NDArray[np.uint8]:
+    """Colors, 0 to 255, of such or of shares, 0 to 1, as Open3D has them."""
     colors = np.asarray(values)
-    # Open3D's are shares, 0 to 1.
-    return _rows(np.rint(255.0 * colors.clip(0, 1)) if colors.dtype.kind == "f" else colors, np.uint8, "colors")
+    shares = colors.dtype.kind == "f"
+    most, rounding = (1, 1e-6) if shares else (255, 0)
+    if colors.dtype.kind in "fiu" and not ((colors >= -rounding) & (colors <= most + rounding)).all():
+        raise _upcr.CloudError(f"colors: {'shares' if shares else 'whole numbers'} from 0 to {most} are needed")
+    return _rows(np.rint(255 * colors.clip(0, 1)) if shares else colors, np.uint8, "colors")
