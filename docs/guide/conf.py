@@ -39,6 +39,8 @@ autodoc_type_aliases = {name: name for name in ("CloudLike", "FloatArray", "npt.
 
 html_theme = "furo"
 html_title = f"UPCR {release}"
+html_static_path = ["guide.css"]
+html_css_files = ["guide.css"]
 html_copy_source = False
 html_show_copyright = False
 html_show_sphinx = False
