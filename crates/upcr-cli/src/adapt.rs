@@ -1,10 +1,11 @@
 //! `upcr adapt`: learned weights learn on from the clouds at hand, without labels.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use clap::ValueEnum;
+use upcr::net::EMBEDDED_WEIGHTS;
 use upcr_lab::data::{self, Split, pairs::POINTS};
 use upcr_lab::files::write_atomically;
 use upcr_lab::models::Learned;
@@ -27,9 +28,9 @@ Files in the output folder:
 #[derive(clap::Args)]
 #[command(after_help = AFTER_HELP)]
 pub struct Args {
-    /// Weights to start from
+    /// Weights to start from [default: the ones inside the program]
     #[arg(long, value_name = "FILE")]
-    weights: PathBuf,
+    weights: Option<PathBuf>,
     /// Folder of clouds, or a data set
     #[arg(long, value_name = "PATH")]
     clouds: PathBuf,
@@ -94,11 +95,14 @@ pub fn run(args: &Args) -> Result<Status> {
 }
 
 fn learn(args: &Args) -> Result<Status> {
-    let bytes = std::fs::read(&args.weights).with_context(|| args.weights.display().to_string())?;
-    let file = TensorFile::from_bytes(&bytes, &args.weights)?;
-    let network = Learned::restore(&file, &args.weights, &args.backend.device().autodiff())?;
+    let (path, bytes) = match &args.weights {
+        Some(path) => (path.as_path(), std::fs::read(path).with_context(|| path.display().to_string())?),
+        None => (Path::new("the weights inside"), EMBEDDED_WEIGHTS.to_vec()),
+    };
+    let file = TensorFile::from_bytes(&bytes, path)?;
+    let network = Learned::restore(&file, path, &args.backend.device().autodiff())?;
     if !matches!(network, Learned::Upcr(_)) {
-        let path = args.weights.display();
+        let path = path.display();
         bail!("{path}: only UPCR's weights learn without labels; others are trained by `upcr train`");
     }
     let shapes = Arc::new(data::open(&args.clouds, args.split.into())?);

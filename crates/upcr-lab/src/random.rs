@@ -32,9 +32,9 @@ pub fn rotation(rng: &mut impl Rng) -> Matrix3<f64> {
     UnitQuaternion::from_quaternion(quaternion).to_rotation_matrix().into_inner()
 }
 
-/// A seed from a text: its 64-bit Fowler–Noll–Vo hash (1a), which unlike the standard library's never changes.
-pub fn fnv1a(text: &str) -> u64 {
-    text.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+/// A number from a text or bytes: its 64-bit Fowler–Noll–Vo hash (1a), which unlike the standard library's never changes.
+pub fn fnv1a(text: &(impl AsRef<[u8]> + ?Sized)) -> u64 {
+    text.as_ref().iter().fold(0xcbf2_9ce4_8422_2325, |hash, &byte| {
         (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
     })
 }

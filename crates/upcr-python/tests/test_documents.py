@@ -2,7 +2,7 @@
 
 In a page of the guide every fenced block is one of these, and is run or checked as such:
 
-- ``python``: run in order, in one namespace a page; where Open3D cannot be imported, up to the first that names it.
+- ``python``: run in order, in one namespace a page; where Open3D or Ray cannot be imported, up to the first that names it.
 - ``sh``: run by bash, ended by the first command that fails. A last line ``... # exit status 3`` says how.
 - ``output``: what the block before it prints: words alike, numbers nearly, ``…`` standing for anything.
 - ``text``, ``console``: not run; nor ``{eval-rst}``, which is Sphinx's to check.
@@ -23,6 +23,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,7 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", sysconfig.get_path("scripts") + os.pathsep + os.environ["PATH"])
     adapt = upcr.adapt
-    monkeypatch.setattr(upcr, "adapt", lambda *given, **options: adapt(*given, **{**options, **SHORT}))
+    monkeypatch.setattr(upcr, "adapt", lambda *given, **options: adapt(*given, **{**SHORT, **options}))
     return tmp_path
 
 
@@ -129,7 +130,7 @@ def agree(told: str, printed: str) -> bool:
 
 
 def run(document: Path, languages: set[str]) -> Iterator[str]:
-    """Runs a document's blocks of these languages; yields those that were left out for want of Open3D."""
+    """Runs a document's blocks of these languages; yields those that were left out for want of a package."""
     namespace: dict[str, Any] = {"__name__": "__main__"}
     printed: str | None = None
     runs = True
@@ -137,7 +138,7 @@ def run(document: Path, languages: set[str]) -> Iterator[str]:
         match block.language:
             case language if language not in languages:
                 continue
-            case "python" if not (runs := runs and (has_open3d() or "open3d" not in block.text)):
+            case "python" if not (runs := runs and not any(name in block.text for name in missing())):
                 printed = LEFT_OUT
                 yield str(block)
             case "python":
@@ -153,12 +154,15 @@ def run(document: Path, languages: set[str]) -> Iterator[str]:
 
 
 @cache
-def has_open3d() -> bool:
-    try:
-        import open3d
-    except ImportError:
-        return False
-    return True
+def missing() -> list[str]:
+    """Words for packages that pages use where they are there, and are not."""
+    found = []
+    for word, package in {"open3d": "open3d", "upcr.ray": "ray"}.items():
+        try:
+            import_module(package)
+        except ImportError:
+            found.append(word)
+    return found
 
 
 @pytest.mark.parametrize("document", READMES, ids=["root", "package"])
@@ -172,7 +176,7 @@ def test_guide(document: Path) -> None:
     strange = [f"{block}: {block.language!r}" for block in blocks(document) if block.language not in LANGUAGES]
     assert strange == [], f"there is no way to check these; there are {sorted(LANGUAGES)}"
     if skipped := list(run(document, LANGUAGES)):
-        pytest.skip(f"open3d cannot be imported; run but for {len(skipped)} blocks, from {skipped[0]} on")
+        pytest.skip(f"{missing()} cannot be imported; run but for {len(skipped)} blocks, from {skipped[0]} on")
 
 
 @pytest.mark.parametrize(

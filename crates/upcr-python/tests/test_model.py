@@ -68,6 +68,20 @@ def test_adaptation(shapes: list[Points], tmp_path: Path) -> None:
     upcr.register(shapes[0], shapes[0], method="upcr", network=done.model)
 
 
+def test_a_folder_is_gone_on_with_where_all_is_the_same(shapes: list[Points], tmp_path: Path) -> None:
+    def learn(shapes: list[Points], folder: Path, weights: upcr.Model | None = None) -> tuple[upcr.Model, bytes]:
+        """What is learned, whether or not it helped, and what it makes of two clouds."""
+        upcr.adapt(shapes, weights, folder=folder, epochs=1, points=64, learning_rate=1e-3)
+        model = upcr.Model.load(folder / "checkpoint.safetensors")
+        return model, model.predict(bumpy(100, 1), bumpy(100, 2)).tobytes()
+
+    model, first = learn(shapes, tmp_path / "run")
+    assert learn(shapes, tmp_path / "run")[1] == first, "it was at its end"
+    others = shapes[::-1]
+    assert learn(others, tmp_path / "run")[1] == learn(others, tmp_path / "new")[1] != first
+    assert learn(others, tmp_path / "run", model)[1] == learn(others, tmp_path / "third", model)[1] != first
+
+
 def test_what_adaptation_refuses(shapes: list[Points], tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         upcr.adapt(tmp_path / "none")

@@ -178,14 +178,14 @@ def test_a_killed_worker_loses_and_doubles_nothing(tmp_path: Path) -> None:
 
 def test_adaptation_is_that_of_one_machine(tmp_path: Path) -> None:
     clouds = [bumpy(300, i) for i in range(7)]
-    settings = {"epochs": 6, "points": 64, "seed": 5}
-    alone = upcr.adapt(clouds, parts=3, **settings)  # type: ignore[arg-type]
+    settings: dict[str, Any] = {"epochs": 6, "points": 64, "seed": 5}
+    alone = upcr.adapt(clouds, parts=3, **settings)
     dataset = ray.data.from_items([{"cloud": cloud} for cloud in clouds], override_num_blocks=2)
-    together = upcr.ray.adapt(dataset, parts=3, workers=2, storage_path=str(tmp_path), **settings)  # type: ignore[arg-type]
+    together = upcr.ray.adapt(dataset, parts=3, workers=2, storage_path=str(tmp_path), **settings)
     assert together.model.to_bytes() == alone.model.to_bytes()
     assert (together.before, together.after) == (alone.before, alone.after)
     assert together.steps == alone.steps == 6
-    whole = upcr.adapt(clouds, **settings)  # type: ignore[arg-type]
+    whole = upcr.adapt(clouds, **settings)
     assert whole.model.to_bytes() != alone.model.to_bytes(), "parts normalise themselves"
     with pytest.raises(upcr.SettingError, match="8 parts"):
         upcr.ray.adapt(dataset, parts=8)
@@ -195,7 +195,7 @@ def test_adaptation_is_that_of_one_machine(tmp_path: Path) -> None:
 
 def test_learning_goes_on_where_a_worker_died(tmp_path: Path) -> None:
     clouds = [bumpy(300, i) for i in range(7)]
-    settings = {"epochs": 150, "points": 128, "seed": 5}
+    settings: dict[str, Any] = {"epochs": 150, "points": 128, "seed": 5}
     dataset = ray.data.from_items([{"cloud": cloud} for cloud in clouds])
     before = set(processes("RayTrainWorker"))
     killed = []
@@ -211,8 +211,8 @@ def test_learning_goes_on_where_a_worker_died(tmp_path: Path) -> None:
     killer.start()
     together = upcr.ray.adapt(
         dataset, workers=2, name="run", storage_path=str(tmp_path), checkpoint_seconds=1.5, **settings
-    )  # type: ignore[arg-type]
-    alone = upcr.adapt(clouds, parts=2, **settings)  # type: ignore[arg-type]
+    )
+    alone = upcr.adapt(clouds, parts=2, **settings)
     assert len(killed) == 1
     assert together.model.to_bytes() == alone.model.to_bytes()
     assert together.helped == alone.helped and together.after == alone.after

@@ -13,6 +13,7 @@ use super::trainer::{Part, Poses, Trainer, Validation, validate_together};
 use crate::data::Shapes;
 use crate::data::pairs::Mixture;
 use crate::models::Learned;
+use crate::random::fnv1a;
 
 /// What came of an adaptation.
 #[derive(Debug)]
@@ -60,8 +61,26 @@ pub struct Material {
     pub poses: Poses,
 }
 
-/// Learns on from all shapes without labels. The run's checkpoint comes to `folder`; a run of the same configuration
-/// that was stopped there goes on.
+impl Material {
+    /// A number that tells apart what runs start from: the network, all parts' shapes, and the pairs made of them.
+    fn origin(&self, network: &Learned, team: &mut dyn Team) -> Result<u64> {
+        let bytes = |cloud: &Vec<[f32; 3]>| -> Vec<u8> {
+            cloud.as_flattened().iter().flat_map(|value| value.to_le_bytes()).collect()
+        };
+        let of_part = |shapes: &Arc<Shapes>| {
+            let hashes: Vec<u64> = shapes.clouds.iter().map(|cloud| fnv1a(&bytes(cloud))).collect();
+            let hash = fnv1a(&format!("{hashes:?}"));
+            // Halves are exact as floating-point numbers.
+            vec![(hash >> 32) as f64, f64::from(hash as u32)]
+        };
+        let parts = team.gather(self.parts.iter().map(of_part).collect())?;
+        let weights = fnv1a(&network.store().to_bytes()?);
+        Ok(fnv1a(&format!("{weights} {parts:?} {:?} {:?}", self.mixture, self.poses)))
+    }
+}
+
+/// Learns on from all shapes without labels. The run's checkpoint comes to `folder`; a run that was stopped there goes on
+/// where configuration, weights, shapes and pairs are the same.
 ///
 /// # Errors
 /// As [`Trainer::run_on`].
@@ -81,7 +100,8 @@ pub fn adapt(
         validate_together(network, &validations, team).map(Option::unwrap_or_default)
     };
     let before = validate(network, team)?;
-    let mut trainer = Trainer::adapting(config, network, folder)?;
+    let origin = material.origin(network, team)?;
+    let mut trainer = Trainer::adapting(config, network, origin, folder)?;
     let part = |shapes: &Arc<Shapes>| Part { shapes: shapes.clone(), held_out: shapes.clone() };
     let parts: Vec<Part> = parts.iter().map(part).collect();
     let finished = trainer.run_on(&parts, mixture, *poses, team, watcher)?;

@@ -22,6 +22,9 @@ const STATE_KEY: &str = "upcr.training";
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct State {
     pub config: TrainingConfig,
+    /// Tells apart what adaptations start from.
+    #[serde(default)]
+    pub origin: u64,
     /// Steps done.
     pub step: u64,
     /// Seconds spent.

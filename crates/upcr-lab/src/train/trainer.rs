@@ -130,7 +130,7 @@ impl Trainer {
         config.check()?;
         let device = device.clone().autodiff();
         let network = config.network.init(config.seed, &device)?;
-        let state = State { config, step: 0, seconds: 0.0, history: History::new() };
+        let state = State { config, origin: 0, step: 0, seconds: 0.0, history: History::new() };
         Ok(Self { folder: folder.into(), network, optimizer: adam(), state })
     }
 
@@ -145,16 +145,18 @@ impl Trainer {
         }
     }
 
-    /// A run on weights that were learned before; goes on where one of this configuration in `folder` was stopped.
+    /// A run on weights that were learned before; goes on where one of this configuration and origin in `folder` was
+    /// stopped. `origin` tells apart what is learned from, weights and shapes.
     ///
     /// # Errors
     /// Where the configuration cannot be run, or a checkpoint is damaged.
-    pub fn adapting(config: TrainingConfig, network: &Learned, folder: &Path) -> Result<Self> {
+    pub fn adapting(config: TrainingConfig, network: &Learned, origin: u64, folder: &Path) -> Result<Self> {
         config.check()?;
-        if let Some(stopped) = Self::stopped(&config, folder, &network.device().inner())? {
+        let stopped = Self::stopped(&config, folder, &network.device().inner())?;
+        if let Some(stopped) = stopped.filter(|stopped| stopped.state.origin == origin) {
             return Ok(stopped);
         }
-        let state = State { config, step: 0, seconds: 0.0, history: History::new() };
+        let state = State { config, origin, step: 0, seconds: 0.0, history: History::new() };
         Ok(Self { folder: folder.into(), network: network.clone(), optimizer: adam(), state })
     }
 

@@ -178,10 +178,8 @@ class Registration:
     @cached_property
     def evidence(self) -> Evidence:
         """What the probability is made of."""
-        evidence = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in self._told["evidence"].items()
-        }
-        return Evidence(**evidence)
+        told: dict[str, Any] = self._told["evidence"]
+        return Evidence(**{name: _pair(value) for name, value in told.items()})
 
     @cached_property
     def points_used(self) -> tuple[int, int]:
@@ -245,6 +243,11 @@ class Registration:
         lines.append(("method", f"{self.method}, voxel size {self.voxel_size:.6g}"))
         lines.append(("time", f"{self.timings_ms.total:.1f} ms"))
         return lines
+
+
+def _pair(value: Any) -> Any:
+    """What are two of a kind in Rust."""
+    return tuple(value) if isinstance(value, list) else value
 
 
 def registration(parts: _Parts) -> Registration:

@@ -154,7 +154,8 @@ impl Meeting {
 
     /// Root mean square of the distances within `limit`.
     pub fn rmse(&self, limit: f32) -> f64 {
-        let sum: f64 = self.within(limit).map(|b| f64::from(b.distance_sq)).sum();
+        // Of none it is 0, where Rust's sum is -0.
+        let sum = self.within(limit).fold(0.0, |sum, b| sum + f64::from(b.distance_sq));
         (sum / self.count(limit).max(1) as f64).sqrt()
     }
 }

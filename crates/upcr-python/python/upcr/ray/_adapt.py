@@ -9,7 +9,6 @@ import shutil
 import tempfile
 import uuid
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -119,7 +118,8 @@ def adapt(
             checkpoint_config=CheckpointConfig(num_to_keep=1),
         ),
     )
-    found = trainer.fit().return_value
+    result: Any = trainer.fit()
+    found: dict[str, Any] = result.return_value
     model = Model.from_bytes(found.pop("model"))
     before, after = Errors(**found.pop("before")), Errors(**found.pop("after"))
     return Adaptation(model=model, before=before, after=after, **found)
@@ -160,7 +160,6 @@ def _clouds(blocks: list[ray.ObjectRef[Any]], column: str) -> Iterator[Any]:
             yield value if isinstance(value, str) else np.asarray(value)
 
 
-@ray.remote(num_cpus=0)
 class _Board:
     """Where members leave word of their rows, and wait for all others'."""
 
@@ -185,9 +184,10 @@ class _Team:
 
     def __init__(self, rank: int, workers: int) -> None:
         self.rank = rank
+        self.board: Any
         name = f"upcr-{uuid.uuid4()}" if rank == 0 else None
         if name is not None:
-            self.board = _Board.options(name=name).remote(workers)
+            self.board = ray.remote(num_cpus=0)(_Board).options(name=name).remote(workers)
         name = broadcast_from_rank_zero(name)
         if rank != 0:
             self.board = ray.get_actor(name)

@@ -7,13 +7,13 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import ray.data
 
-from .. import TRUSTWORTHY, _upcr
+from .. import _upcr
 from .._cloud import PointCloud, read
 from .._register import register_batch
 from .._registration import Registration
@@ -154,20 +154,18 @@ def read_pairs(path: str | os.PathLike[str]) -> ray.data.Dataset:
     name = os.fspath(path)
     if name.endswith(".parquet") or not os.path.isfile(name):
         return ray.data.read_parquet(name)
-    rows = []
+    rows: list[dict[str, Any]] = []
     with open(name, encoding="utf-8") as lines:
         for number, line in enumerate(lines, 1):
-            columns = [part.strip() for part in line.split("\t")] if "\t" in line else line.split()
-            columns = [column for column in columns if column]
-            if not columns or columns[0].startswith("#"):
+            files = [part.strip() for part in line.split("\t")] if "\t" in line else line.split()
+            if not any(files) or files[0].startswith("#"):
                 continue
-            if len(columns) not in (2, 3):
+            if len(files) not in (2, 3):
                 raise _upcr.FormatError(f"{name}: line {number}: not two or three columns: {line.rstrip()!r}")
-            files = [column if "://" in column else os.path.abspath(column) for column in columns]
-            rows.append([len(rows), *files, *[None] * (3 - len(files))])
-    columns = dict(zip(("id", "source", "target", "init"), zip(*rows), strict=True)) if rows else {}
-    types = {"id": pa.int64(), "source": pa.string(), "target": pa.string(), "init": pa.string()}
-    table = pa.table({name: pa.array(columns.get(name, []), kind) for name, kind in types.items()})
+            files = [file if "://" in file else os.path.abspath(file) for file in files]
+            rows.append(dict(zip(("source", "target", "init"), files)) | {"id": len(rows)})
+    schema = pa.schema([("id", pa.int64()), *[(name, pa.string()) for name in ("source", "target", "init")]])
+    table = pa.Table.from_pylist(rows, schema=schema)
     # Blocks that several workers can take.
     size = max(1, min(1024, -(-len(rows) // 64)))
     return ray.data.from_arrow([table.slice(start, size) for start in range(0, max(len(rows), 1), size)])
