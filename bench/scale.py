@@ -95,6 +95,25 @@ def cluster(pairs: Path, out: Path, workers: int, kill_at: int | None = None) ->
     return time.perf_counter() - start, done
 
 
+class Nothing:
+    """Does nothing with a block."""
+
+    def __call__(self, block: pa.Table) -> pa.Table:
+        return block
+
+
+def blocks_a_second(blocks: int, workers: int) -> float:
+    """How many blocks Ray hands to workers that do nothing with them, once these have started."""
+    seconds = []
+    for count in (workers, blocks):
+        dataset = ray.data.range(count, override_num_blocks=count).materialize()
+        pool = ray.data.ActorPoolStrategy(size=workers)
+        start = time.perf_counter()
+        dataset.map_batches(Nothing, batch_size=None, batch_format="pyarrow", compute=pool, num_cpus=1).materialize()
+        seconds.append(time.perf_counter() - start)
+    return (blocks - workers) / (seconds[1] - seconds[0])
+
+
 def compare(name: str, out: Path, expected: pa.Table) -> bool:
     """Whether the folder's rows are those expected, times aside."""
     rows = pq.read_table(out)
@@ -116,12 +135,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--pairs", type=int, default=10_000)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--blocks", type=int, default=2000, help="empty blocks, to see how many Ray hands out a second")
     options = parser.parse_args()
     if not (data.DATA / "shapes69").is_dir():
         sys.exit(f"no shapes at {data.DATA} (set UPCR_DATA): nothing to do")
     # Reading and writing take a processor's share as well, but hardly its time.
     ray.init(num_cpus=options.workers + 1, include_dashboard=False, logging_level=logging.ERROR, log_to_driver=False)
     ray.data.DataContext.get_current().enable_progress_bars = False
+    print(f"{blocks_a_second(options.blocks, options.workers):.0f} empty blocks a second", flush=True)
     good = True
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)

@@ -6,6 +6,7 @@ The source folder is ``docs/``, so that the pages and the documents that they re
 import re
 from dataclasses import is_dataclass
 from importlib.metadata import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,16 @@ extensions = ["myst_parser", "sphinx.ext.autodoc"]
 nitpicky = True
 # Types of other packages, whose references are not at hand without a network, and names that speak for themselves.
 nitpick_ignore_regex = [
-    ("py:class", r"(numpy|npt|os|collections|typing)\..*|NDArray|Unpack"),
-    ("py:class", "CloudLike|FloatArray|Pair|Method|Feature|Refinement|Kernel"),
+    ("py:class", r"(numpy|npt|os|collections|typing|pyarrow|pa|ray)\..*|NDArray|Unpack"),
+    ("py:class", "CloudLike|FloatArray|Pairs?|Method|Feature|Refinement|Kernel|Dataset|Table"),
+    ("py:exc", r"ray\..*"),
 ]
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
 
+# `upcr.ray` can be described without Ray.
+autodoc_mock_imports = [name for name in ("pyarrow", "ray") if find_spec(name) is None]
 autoclass_content = "both"
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
