@@ -93,7 +93,7 @@ def test_layouts_of_columns(tmp_path: Path) -> None:
     by_prior = upcr.register(source, target, init=guess, method="prior")
     row = upcr.ray.Registrar(method="prior")(flat).to_pylist()[0]
     assert np.array_equal(np.array(row["T_target_source"]).reshape(4, 4), by_prior.T_target_source)
-    assert row["init"] == guess.ravel().tolist(), "a guess is no cloud"
+    assert row["init"] == guess.ravel().tolist() and not {"source", "target"} & set(row)
     rows = upcr.ray.Registrar(source="a", target="b")(files).to_pylist()
     assert [row["error"] is None for row in rows] == [True, True, False]
     assert "none.ply" in rows[2]["error"] and rows[0]["a"] == str(tmp_path / "s.ply")
@@ -108,6 +108,8 @@ def test_layouts_of_columns(tmp_path: Path) -> None:
 
 def test_what_is_wrong_is_said() -> None:
     pairs = table(1)
+    with pytest.warns(UserWarning, match="all of the cluster's processors"):
+        upcr.ray.register_pairs(ray.data.from_arrow(pairs), workers=3)
     with pytest.raises(upcr.SettingError, match="no column scan; there are id, source, target"):
         upcr.ray.Registrar(source="scan")(pairs)
     with pytest.raises(upcr.SettingError, match="rename"):

@@ -24,7 +24,9 @@ pub struct TrainingConfig {
     pub validation_every_nth: usize,
     /// Steps between two validations.
     pub validation_steps: u64,
-    /// Parts in which a batch is seen, each normalising itself; several machines can share them out.
+    /// Parts in which a batch is seen, each normalising itself; several machines can share them out. One is not told: runs
+    /// are known by their configurations.
+    #[serde(skip_serializing_if = "is_one")]
     pub parts: usize,
     /// Seconds between checkpoints.
     pub checkpoint_seconds: f64,
@@ -174,14 +176,17 @@ impl TrainingConfig {
         let warm = ((step + 1) as f64 / self.warmup_steps.max(1) as f64).min(1.0);
         self.learning_rate * decay * warm
     }
-}
 
-impl TrainingConfig {
     /// The seed of what is random in a part of something named so.
     pub(super) fn seed_of(&self, what: &str, part: usize) -> u64 {
         let part = if self.parts == 1 { String::new() } else { format!(" part {part}") };
         random::fnv1a(&format!("{} {what}{part}", self.seed))
     }
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)] // serde hands references
+fn is_one(parts: &usize) -> bool {
+    *parts == 1
 }
 
 /// Puts the values of `changed` in the place of those of `table`, keeping the others.
@@ -253,6 +258,8 @@ mod tests {
         assert_eq!((&whole.stages, &whole_network.widths), (&quick.stages, &quick_network.widths));
         assert_eq!(upcr(&quick.with("network.widths=[4, 8]").unwrap()).widths, [4, 8]);
         assert_eq!(quick.with("learning_rate = 0.5").unwrap().learning_rate, 0.5);
+        let parts = quick.with("parts=4").unwrap();
+        assert_eq!(TrainingConfig::from_toml(&parts.to_toml()).unwrap().parts, 4);
         for change in ["learning_rate", "learning_rate=fast", "learnin_rate=1.0", "network.k=0"] {
             assert!(quick.with(change).is_err(), "{change}");
         }

@@ -82,8 +82,10 @@ def adapt(
         weights = Model.default()
     elif not isinstance(weights, Model):
         weights = Model.load(weights)
-    # In memory once, so that a part's rows are the same for whoever learns from it.
-    rows = clouds.select_columns([column]).materialize()
+    # In memory once and in order, so that a part's rows are the same for whoever learns from it, and in the next run.
+    rows = clouds.select_columns([column])
+    rows.context.execution_options.preserve_order = True
+    rows = rows.materialize()
     count = rows.count()
     if count < parts:
         raise _upcr.SettingError(f"setting `parts`: {count} clouds make no {parts} parts")

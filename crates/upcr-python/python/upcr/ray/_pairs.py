@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from .._settings import Settings
-
 
 SCHEMA = pa.schema(
     [
@@ -59,7 +58,7 @@ _MATRICES = ("T_target_source", "covariance")
 class Registrar:
     """Registers the pairs of a table, a row each: what each worker of :func:`register_pairs` does, and of use without Ray.
 
-    The rows that come back are the table's, in order, without its columns of points, and with those of :data:`SCHEMA`.
+    The rows that come back are the table's, in order, with the columns of :data:`SCHEMA` in place of points.
     """
 
     def __init__(self, *, source: str = "source", target: str = "target", **settings: Unpack[Settings]) -> None:
@@ -81,7 +80,8 @@ class Registrar:
             looked_at = [pair for pair in clouds if not isinstance(pair, Exception)]
             answers = iter(register_batch(looked_at, errors="return", **self.settings))
             found = [pair if isinstance(pair, Exception) else next(answers) for pair in clouds]
-        kept = pairs.select([name for name in pairs.column_names if not _is_points(pairs.schema.field(name).type)])
+        points = [name for name in (self.source, self.target) if not _is_text(pairs.schema.field(name).type)]
+        kept = pairs.drop_columns(points)
         rows = pa.Table.from_pylist([_row(one) for one in found], schema=SCHEMA)
         for name in SCHEMA.names:
             kept = kept.append_column(SCHEMA.field(name), rows.column(name))
@@ -112,7 +112,7 @@ def register_pairs(
         pairs: Rows with the columns ``source`` and ``target``: names of files (which all workers can read; or URIs that
             Arrow's file systems know, such as ``s3://``), or points of shape (N, 3). Further columns that are looked at
             where they are there: ``init`` (a first guess, shape (4, 4), or a file with one), ``source_viewpoint`` and
-            ``target_viewpoint`` (shape (3,)). All columns that are not points are kept.
+            ``target_viewpoint`` (shape (3,)). All columns are kept but the clouds' own where they are points.
         source: Name of the column of the clouds that are moved.
         target: Name of the column of those that stay.
         workers: Processes that register; else as many as find room.
@@ -127,6 +127,9 @@ def register_pairs(
     """
     if "threads" in settings:
         raise _upcr.SettingError("setting `threads`: a worker's are told by `cpus_per_worker`")
+    if workers and ray.is_initialized() and workers * cpus_per_worker >= ray.cluster_resources().get("CPU", 0):
+        text = "the workers take all of the cluster's processors: unless it grows, none is left for reading and writing"
+        warnings.warn(text, stacklevel=2)
     pool = ray.data.ActorPoolStrategy(size=workers) if workers else ray.data.ActorPoolStrategy(min_size=1)
     # Ray's blocks are as large as memory likes, and a block is what a worker is handed and what is done again.
     return pairs.repartition(target_num_rows_per_block=batch_size).map_batches(
@@ -188,7 +191,7 @@ def _value(scalar: pa.Scalar) -> Any:
         rows = None if values is None else len(values)
         while values is not None and isinstance(values, (pa.ListArray, pa.LargeListArray, pa.FixedSizeListArray)):
             values = values.flatten()
-        if values is None or pa.types.is_string(values.type):
+        if values is None or _is_text(values.type):
             return scalar.as_py()
         flat = values.to_numpy(zero_copy_only=False)
         # A list of rows, or of their entries.
@@ -196,9 +199,8 @@ def _value(scalar: pa.Scalar) -> Any:
     return scalar.as_py()
 
 
-def _is_points(kind: pa.DataType) -> bool:
-    """Whether a column's values are arrays of more numbers than a pose has."""
-    return isinstance(kind, pa.BaseExtensionType) or pa.types.is_list(kind) and pa.types.is_nested(kind.value_type)
+def _is_text(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind))
 
 
 def _cloud(row: Mapping[str, Any], name: str, scratch: Path) -> str | PointCloud:
