@@ -3,7 +3,9 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use numpy::{Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyUntypedArrayMethods};
+use numpy::ndarray::Array2;
+use numpy::{Element, IntoPyArray, PyArray2, PyReadonlyArray2, PyUntypedArrayMethods};
+use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
 use pyo3::types::PyString;
 use upcr::io::{self, ReadOptions};
@@ -143,8 +145,8 @@ pub fn array<const D: usize, T: Element>(
     py: Python<'_>,
     rows: Vec<[T; D]>,
 ) -> PyResult<Bound<'_, PyArray2<T>>> {
-    let shape = [rows.len(), D];
-    PyArray1::from_vec(py, rows.into_flattened()).reshape(shape)
+    let rows = Array2::from_shape_vec((rows.len(), D), rows.into_flattened());
+    Ok(rows.map_err(|error| PyRuntimeError::new_err(error.to_string()))?.into_pyarray(py))
 }
 
 /// A cloud's points, normals, colours and viewpoint.
