@@ -31,6 +31,8 @@ mod _upcr {
     use super::model::Model;
     #[pymodule_export]
     use super::register::{register, register_batch};
+    #[pymodule_export]
+    use super::settings::check;
 
     #[pymodule_export]
     const DEFAULT_K: usize = upcr::features::DEFAULT_K;

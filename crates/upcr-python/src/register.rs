@@ -134,6 +134,8 @@ pub fn register<'py>(
 
 /// A pair of a batch with its own first guess, where it has one.
 struct Pair {
+    /// Its place in the list.
+    number: usize,
     source: Arc<Input>,
     target: Arc<Input>,
     init: Option<Rigid>,
@@ -151,14 +153,20 @@ impl Pair {
     }
 }
 
-/// Registers pairs of places in `clouds`, several at a time; results and exceptions come in the pairs' order. `progress`
+/// The exception with a note of the pair's number, where this Python has notes.
+fn noted(py: Python<'_>, error: PyErr, number: usize) -> PyErr {
+    drop(error.value(py).call_method1("add_note", (format!("pair {number}"),)));
+    error
+}
+
+/// Registers numbered pairs of places in `clouds`, several at a time; results and exceptions come in the pairs' order. `progress`
 /// is called with the number of pairs done. Where `raises`, the first pair's exception ends it.
 #[pyfunction]
 #[pyo3(signature = (clouds, pairs, given, raises, progress))]
 pub fn register_batch<'py>(
     py: Python<'py>,
     clouds: Vec<Bound<'py, PyAny>>,
-    pairs: Vec<(usize, usize, Option<Bound<'py, PyAny>>)>,
+    pairs: Vec<(usize, usize, usize, Option<Bound<'py, PyAny>>)>,
     given: &Bound<'py, PyDict>,
     raises: bool,
     progress: Option<Bound<'py, PyAny>>,
@@ -177,13 +185,13 @@ pub fn register_batch<'py>(
     let mut ready = Vec::new();
     // Why a pair cannot be looked at, where it cannot.
     let mut refused = Vec::new();
-    for (source, target, init) in pairs {
+    for (number, source, target, init) in pairs {
         match init.map(|init| pose("init", &init)).transpose() {
             Ok(init) => {
-                ready.push(Pair { source: input(source)?, target: input(target)?, init });
+                ready.push(Pair { number, source: input(source)?, target: input(target)?, init });
                 refused.push(None);
             }
-            Err(error) if raises => return Err(error),
+            Err(error) if raises => return Err(noted(py, error, number)),
             Err(error) => refused.push(Some(error)),
         }
     }
@@ -211,7 +219,7 @@ pub fn register_batch<'py>(
             Some(Err(error)) => {
                 let error = cloud_exception(error, &pair.source, &pair.target);
                 if raises {
-                    return Err(error);
+                    return Err(noted(py, error, pair.number));
                 }
                 results.append(error.into_value(py))?;
             }

@@ -29,6 +29,12 @@ pub fn settings(given: &Bound<'_, PyDict>) -> PyResult<Settings> {
     Ok(settings)
 }
 
+/// Refuses settings that no registration can have.
+#[pyfunction]
+pub fn check(given: &Bound<'_, PyDict>) -> PyResult<()> {
+    settings(given)?.check().map_err(exception)
+}
+
 fn tell(settings: &mut Settings, name: &str, value: &Bound<'_, PyAny>) -> PyResult<()> {
     match name {
         "method" => settings.method = choice(name, value)?,

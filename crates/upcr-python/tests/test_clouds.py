@@ -140,3 +140,13 @@ def test_open3d(blob: Points, tmp_path: Path) -> None:
     read = upcr.read(tmp_path / "a.ply")
     assert np.array_equal(read.colors, cloud.colors)  # type: ignore[arg-type]
     assert np.array_equal(upcr.features.fpfh(theirs), upcr.features.fpfh(cloud))
+
+
+def test_clouds_are_made_of_what_has_points() -> None:
+    cloud = upcr.PointCloud(np.eye(3), normals=np.eye(3), colors=np.eye(3), viewpoint=(0, 0, 1))
+    again = upcr.PointCloud(cloud)
+    assert again.normals is not None and again.colors is not None and again.viewpoint is not None
+    assert (again.points == cloud.points).all() and (again.colors == cloud.colors).all()
+    assert (again.normals == cloud.normals).all() and (again.viewpoint == cloud.viewpoint).all()
+    with pytest.raises(upcr.CloudError, match="colors: 2 rows, where there are 3 points"):
+        upcr.PointCloud(np.eye(3), colors=np.zeros((2, 3)))

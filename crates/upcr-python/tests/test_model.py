@@ -93,6 +93,12 @@ def test_what_adaptation_refuses(shapes: list[Points], tmp_path: Path) -> None:
         upcr.adapt(shapes, pairs="odd")  # type: ignore[arg-type]
     with pytest.raises(upcr.CloudError, match="degenerate"):
         upcr.adapt([np.zeros((50, 3))])
+    with pytest.raises(TypeError, match="several clouds are needed, not one"):
+        upcr.adapt(shapes[0])
+    with pytest.raises(upcr.SettingError, match="3 clouds make no 4 parts"):
+        upcr.adapt(shapes, parts=4)
+    with pytest.raises(upcr.SettingError, match="0 clouds make no 1 part"):
+        upcr.adapt([])
 
 
 def test_pairs_are_the_command_line_s() -> None:

@@ -108,16 +108,29 @@ def test_layouts_of_columns(tmp_path: Path) -> None:
 
 def test_what_is_wrong_is_said() -> None:
     pairs = table(1)
-    with pytest.warns(UserWarning, match="all of the cluster's processors"):
-        upcr.ray.register_pairs(ray.data.from_arrow(pairs), workers=3)
+    dataset = ray.data.from_arrow(pairs)
+    with pytest.warns(UserWarning, match="need 4 processors, and there are 3: unless the cluster grows, they wait for ever"):
+        upcr.ray.register_pairs(dataset, workers=3)
+    with pytest.warns(UserWarning, match="need 4 processors"):
+        upcr.ray.register_pairs(dataset, cpus_per_worker=3)
     with pytest.raises(upcr.SettingError, match="no column scan; there are id, source, target"):
-        upcr.ray.Registrar(source="scan")(pairs)
+        upcr.ray.register_pairs(dataset, source="scan")
     with pytest.raises(upcr.SettingError, match="rename"):
         upcr.ray.Registrar()(pairs.append_column("error", pa.array([""])))
     with pytest.raises(upcr.SettingError, match="cpus_per_worker"):
-        upcr.ray.register_pairs(ray.data.from_arrow(pairs), threads=2)
+        upcr.ray.register_pairs(dataset, threads=2)
     with pytest.raises(upcr.SettingError, match="colour"):
-        upcr.ray.Registrar(method="colour")(pairs)  # type: ignore[arg-type]
+        upcr.ray.register_pairs(dataset, method="colour")  # type: ignore[arg-type]
+    with pytest.raises(upcr.SettingError, match="voxel_size"):
+        upcr.ray.register_pairs(dataset, voxel_size=-1)
+    with pytest.raises(upcr.SettingError, match="`workers`: must be 1 at least, not 0"):
+        upcr.ray.register_pairs(dataset, workers=0)
+    no_dataset: Any = ["a.ply"]
+    for function in (upcr.ray.register_pairs, upcr.ray.adapt):
+        with pytest.raises(TypeError, match="a Ray dataset is needed"):
+            function(no_dataset)
+    with pytest.raises(upcr.SettingError, match="no column cloud; there are id, source, target"):
+        upcr.ray.adapt(dataset)
 
 
 def test_lists_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -189,6 +202,11 @@ def test_adaptation_is_that_of_one_machine(tmp_path: Path) -> None:
     assert together.steps == alone.steps == 6
     whole = upcr.adapt(clouds, **settings)
     assert whole.model.to_bytes() != alone.model.to_bytes(), "parts normalise themselves"
+    files = ray.data.from_items([{"cloud": str(tmp_path / f"{i}.ply")} for i in range(3)])
+    for i in range(2):
+        upcr.write(tmp_path / f"{i}.ply", clouds[i])
+    with pytest.raises(FileNotFoundError, match=r"2\.ply"):
+        upcr.ray.adapt(files, storage_path=str(tmp_path), **settings)
     with pytest.raises(upcr.SettingError, match="8 parts"):
         upcr.ray.adapt(dataset, parts=8)
     with pytest.raises(upcr.SettingError, match="3 workers"):

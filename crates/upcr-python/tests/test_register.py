@@ -193,7 +193,7 @@ def test_clouds_that_are_refused(clouds: Clouds, tmp_path: Path) -> None:
         upcr.register(holed, target)
     with pytest.raises(upcr.CloudError, match="target has too few points: 2"):
         upcr.register(source, target[:2])
-    with pytest.raises(upcr.CloudError, match=r"points: an array of shape \(N, 3\)"):
+    with pytest.raises(upcr.CloudError, match=r"(source|target): an array of shape \(N, 3\)"):
         upcr.register(source.T, target)
     with pytest.raises(TypeError, match="complex"):
         upcr.register(source.astype(complex), target)
@@ -328,3 +328,30 @@ def test_batch(clouds: Clouds, found: upcr.Registration, truth: Points) -> None:
     assert few[0].settings["method"] == "fgr" and few[0].settings["seed"] == 3
     with pytest.raises(upcr.SettingError):
         upcr.register_batch(pairs[:1], errors="ignore")  # type: ignore[call-overload]
+
+
+def test_errors_of_a_batch_tell_the_pair(clouds: tuple[Points, Points]) -> None:
+    source, target = clouds
+    few = [(source, source), (source, target[:2])]
+    with pytest.raises(upcr.CloudError, match="target has too few points: 2") as caught:
+        upcr.register_batch(few)
+    assert getattr(caught.value, "__notes__", ["pair 1"]) == ["pair 1"]
+    wrong: list[typing.Any] = [(source, target), ({}, target)]
+    with pytest.raises(TypeError, match=r"pair 1: source: an array of numbers.* is needed, not dict"):
+        upcr.register_batch(wrong)
+    strange: typing.Any
+    for strange in [(source,), 5, (source, target, None, 1)]:
+        with pytest.raises(TypeError, match="pair 0: a source, a target"):
+            upcr.register_batch([strange], errors="return")
+    wrong = [(source, None), few[1], (source, source)]
+    refused = upcr.register_batch(wrong, errors="return")
+    assert [type(one) for one in refused] == [TypeError, upcr.CloudError, upcr.Registration]
+
+
+def test_what_files_may_leave_out_arrays_may_too(clouds: tuple[Points, Points], truth: Points) -> None:
+    found = [upcr.register(*clouds, init=init, method="prior") for init in (truth, truth[:3])]
+    assert np.array_equal(found[0].transformation, found[1].transformation)
+    with pytest.raises(upcr.CloudError, match="source: some entries are masked"):
+        upcr.register(np.ma.masked_array(clouds[0], clouds[0] > 0.05), clouds[1])
+    with pytest.raises(upcr.SettingError, match="three coordinates are needed, not '0,0,0'"):
+        upcr.register(*clouds, source_viewpoint="0,0,0")

@@ -106,8 +106,11 @@ impl Settings {
         if departure < ROUNDING { init } else { Rigid { rotation: nearest_rotation(&init.rotation), ..init } }
     }
 
-    /// Refuses what is out of range.
-    pub(crate) fn check(&self) -> Result<()> {
+    /// Refuses what is out of range, as every registration does.
+    ///
+    /// # Errors
+    /// [`Error::InvalidSetting`] with the setting's name.
+    pub fn check(&self) -> Result<()> {
         let refused = |name, reason| Err(Error::InvalidSetting { name, reason });
         if let Some(v) = self.voxel_size
             && !(v.is_finite() && v > 0.0)

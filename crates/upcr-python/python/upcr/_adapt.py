@@ -9,8 +9,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from . import _upcr
-from ._cloud import CloudLike, packed
+from ._cloud import CloudLike, HasPoints, packed
 from ._model import Model
 
 Pairs = Literal["upc", "uc", "nd", "mixed"]
@@ -91,10 +93,12 @@ def adapt(
     """Lets the network learn on from your own clouds, without labels: what ``upcr adapt`` does.
 
     Args:
-        clouds: A folder of clouds, a data set, or clouds as ``register`` takes them, each of the whole of a shape.
+        clouds: A folder of clouds, a data set, or clouds as ``register`` takes them, each of the whole of a shape. They
+            are thinned to 2,048 points; points that are not finite are left out.
         weights: The network to start from, or its weights file; else the one in the package.
         epochs: Passes over the clouds.
-        points: Points of a cloud.
+        points: Points of a cloud in a pair: at most three quarters of the clouds' where pairs are partial, as half of the
+            ``mixed`` ones are.
         learning_rate: Adam's step size at the start.
         pairs: Pairs that are made of the clouds: ``upc`` (clean), ``nd`` (noisy) or ``mixed``.
         partial: Keep three quarters of each cloud.
@@ -110,7 +114,11 @@ def adapt(
         WeightsError: The weights are of no network that learns so, or learning has lost its way.
         CloudError, FormatError, OSError: A cloud is not usable.
     """
+    if isinstance(clouds, (np.ndarray, HasPoints)):
+        raise TypeError("clouds: a folder or several clouds are needed, not one")
     given: Any = os.fspath(clouds) if isinstance(clouds, (str, os.PathLike)) else [packed(cloud) for cloud in clouds]
+    if isinstance(given, list) and len(given) < max(parts, 1):
+        raise _upcr.SettingError(f"setting `parts`: {len(given)} clouds make no {max(parts, 1)} parts")
     if weights is None:
         weights = Model.default()
     elif not isinstance(weights, Model):

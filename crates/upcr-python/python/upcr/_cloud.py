@@ -12,7 +12,7 @@ import numpy.typing as npt
 from . import _upcr
 
 if TYPE_CHECKING:
-    from ._upcr import _Packed
+    from ._upcr import _Arrays, _Packed
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
@@ -47,17 +47,25 @@ class PointCloud:
 
     def __init__(
         self,
-        points: npt.ArrayLike,
+        points: npt.ArrayLike | HasPoints,
         normals: npt.ArrayLike | None = None,
         colors: npt.ArrayLike | None = None,
         viewpoint: npt.ArrayLike | None = None,
     ) -> None:
         """Takes over arrays that are of the attributes' types already, and converts all others: colors that are not whole
-        numbers are shares, 0 to 1."""
+        numbers are shares, 0 to 1. Of an object with ``points``, such as Open3D's, it takes normals and colors too."""
+        if isinstance(points, HasPoints) and not isinstance(points, np.ndarray):
+            own_points, own_normals, own_colors, own_viewpoint = _arrays(points, normals=True, colors=True)
+            points = own_points
+            normals, colors = own_normals if normals is None else normals, own_colors if colors is None else colors
+            viewpoint = own_viewpoint if viewpoint is None else viewpoint
         self.points = _rows(points, np.float64, "points")
         self.normals = None if normals is None else _rows(normals, np.float32, "normals")
         self.colors = None if colors is None else _bytes(colors)
         self.viewpoint = None if viewpoint is None else np.array(place(viewpoint))
+        for name, rows in (("normals", self.normals), ("colors", self.colors)):
+            if rows is not None and len(rows) != len(self.points):
+                raise _upcr.CloudError(f"{name}: {len(rows)} rows, where there are {len(self.points)} points")
 
     def transformed(self, pose: npt.ArrayLike) -> PointCloud:
         """The cloud moved by ``pose``, shape (4, 4): points and viewpoint as points, normals as directions."""
@@ -137,12 +145,16 @@ def write(
     _upcr.write(os.fspath(path), packed(cloud, normals=True, colors=True), encoding)
 
 
-def packed(cloud: CloudLike, *, normals: bool = False, colors: bool = False) -> _Packed:
+def packed(cloud: CloudLike, name: str = "points", *, normals: bool = False, colors: bool = False) -> _Packed:
     """The cloud as the native half takes it: a file's name, or C-contiguous arrays, with what else is asked for."""
     if isinstance(cloud, (str, os.PathLike)):
         return os.fspath(cloud)
+    return _arrays(cloud, name, normals=normals, colors=colors)
+
+
+def _arrays(cloud: Any, name: str = "points", *, normals: bool, colors: bool) -> _Arrays:
     if isinstance(cloud, np.ndarray):
-        return _rows(cloud, np.float64, "points"), None, None, None
+        return _rows(cloud, np.float64, name), None, None, None
     if hasattr(cloud, "to_legacy"):
         # Open3D's clouds of tensors.
         cloud = cloud.to_legacy()
@@ -150,7 +162,7 @@ def packed(cloud: CloudLike, *, normals: bool = False, colors: bool = False) -> 
     if points is None:
         points = cloud
     return (
-        _rows(points, np.float64, "points"),
+        _rows(points, np.float64, name),
         _rows_of(cloud, "normals", np.float32) if normals else None,
         _colors(cloud) if colors else None,
         place(getattr(cloud, "viewpoint", None)),
@@ -161,18 +173,24 @@ def place(viewpoint: npt.ArrayLike | None) -> tuple[float, float, float] | None:
     """Three coordinates."""
     if viewpoint is None:
         return None
-    values = np.asarray(viewpoint, np.float64).ravel().tolist()
+    try:
+        values = np.asarray(viewpoint, np.float64).ravel().tolist()
+    except (TypeError, ValueError):
+        values = []
     if len(values) != 3:
-        raise _upcr.SettingError(f"setting `viewpoint`: three coordinates are needed, not {len(values)}")
+        raise _upcr.SettingError(f"setting `viewpoint`: three coordinates are needed, not {viewpoint!r}")
     return (values[0], values[1], values[2])
 
 
 def _rows(values: Any, dtype: npt.DTypeLike, name: str) -> npt.NDArray[Any]:
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise _upcr.CloudError(f"{name}: some entries are masked; leave these points out")
     array = np.asarray(values)
     if array.dtype == dtype and array.ndim == 2 and array.shape[1] == 3 and array.flags.c_contiguous and array.flags.aligned:
         return array
     if array.dtype.kind not in "fiu":
-        raise TypeError(f"{name}: numbers are needed, not {array.dtype}")
+        what = type(values).__name__ if array.dtype.kind == "O" else f"an array of {array.dtype}"
+        raise TypeError(f"{name}: an array of numbers, a file's name or an object with `points` is needed, not {what}")
     if array.ndim != 2 or array.shape[1] != 3:
         raise _upcr.CloudError(f"{name}: an array of shape (N, 3) is needed, not {array.shape}")
     return np.require(array, dtype, ["C_CONTIGUOUS", "ALIGNED"])

@@ -106,8 +106,8 @@ def register(
     }
     hear = None if progress is None else lambda stage, method, done: progress(Progress(stage, method, done))
     found = _upcr.register(
-        packed(source),
-        packed(target),
+        packed(source, "source"),
+        packed(target, "target"),
         _settings.packed(settings),
         place(source_viewpoint),
         place(target_viewpoint),
@@ -143,8 +143,8 @@ def register_batch(
 
     Args:
         pairs: Each a source and a target, as ``register`` takes them, and, if there is one, a first guess of the pose.
-            A cloud that is part of several pairs is copied once.
-        errors: ``raise`` the exception of the first pair that has one, or ``return`` it in the pair's place.
+            A cloud that is part of several pairs is copied once. Where its sensor stood, a :class:`PointCloud` says.
+        errors: ``raise`` the exception of the first pair that has one, with a note of its number, from 0, or ``return`` it in the pair's place.
         progress: Called with the number of pairs done, in whatever order they are.
         **settings: As for ``register``, for every pair; ``threads`` are those of all pairs together, ``max_seconds`` and
             ``max_memory_bytes`` each pair's.
@@ -159,11 +159,11 @@ def register_batch(
     # A cloud's identity lasts as long as the cloud.
     held = []
 
-    def place_of(cloud: CloudLike) -> int:
+    def place_of(cloud: CloudLike, name: str) -> int:
         if id(cloud) not in places:
             held.append(cloud)
             try:
-                clouds.append(packed(cloud))
+                clouds.append(packed(cloud, name))
                 places[id(cloud)] = len(clouds) - 1
             except (TypeError, ValueError) as error:
                 places[id(cloud)] = error
@@ -174,13 +174,16 @@ def register_batch(
 
     wanted = []
     refused: dict[int, Exception] = {}
-    for i, (source, target, *init) in enumerate(pairs):
+    for i, pair in enumerate(pairs):
+        if not isinstance(pair, (tuple, list)) or len(pair) not in (2, 3):
+            raise TypeError(f"pair {i}: a source, a target and, if there is one, a first guess are needed")
+        source, target, *init = pair
         try:
             guess = None if not init or init[0] is None else _settings.pose(init[0])
-            wanted.append((place_of(source), place_of(target), guess))
+            wanted.append((i, place_of(source, "source"), place_of(target, "target"), guess))
         except (TypeError, ValueError) as error:
             if errors == "raise":
-                raise
+                raise type(error)(f"pair {i}: {error}") from error
             refused[i] = error
     given = _settings.packed(settings)
     found = iter(_upcr.register_batch(clouds, wanted, given, errors == "raise", progress))

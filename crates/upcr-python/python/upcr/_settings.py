@@ -70,4 +70,6 @@ def pose(init: npt.ArrayLike | str | os.PathLike[str]) -> npt.NDArray[np.float64
     """A first guess as the native half takes it."""
     if isinstance(init, (str, os.PathLike)):
         return os.fspath(init)
-    return np.require(init, np.float64, ["C_CONTIGUOUS", "ALIGNED"])
+    matrix = np.require(init, np.float64, ["C_CONTIGUOUS", "ALIGNED"])
+    # As files have it, the last row may be left out.
+    return np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]]) if matrix.shape == (3, 4) else matrix

@@ -26,6 +26,7 @@ __all__ = [
     "WeightsError",
     "__version__",
     "adapt",
+    "check",
     "describe",
     "main",
     "read",
@@ -82,11 +83,12 @@ def register(
 ) -> _Parts: ...
 def register_batch(
     clouds: Sequence[_Packed],
-    pairs: Sequence[tuple[int, int, _Floats | str | None]],
+    pairs: Sequence[tuple[int, int, int, _Floats | str | None]],
     given: dict[str, Any],
     raises: bool,
     progress: Callable[[int], object] | None,
 ) -> list[_Parts | Exception]: ...
+def check(given: dict[str, Any]) -> None: ...
 def describe(
     cloud: _Packed, kind: str, k: int, radius: float | None, threads: int | None
 ) -> npt.NDArray[np.float32]: ...

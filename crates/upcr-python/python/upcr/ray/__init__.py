@@ -8,6 +8,11 @@ Ray moves the data, restarts what dies and tries again; each pair's result is wh
 machine, to the last bit.
 """
 
+try:
+    import ray.data as _data  # noqa: F401
+except ImportError as error:
+    raise ImportError(f'{error}: upcr.ray needs Ray and Arrow, pip install "upcr[ray]"') from error
+
 from ._adapt import adapt
 from ._pairs import SCHEMA, Registrar, read_pairs, register_pairs
 

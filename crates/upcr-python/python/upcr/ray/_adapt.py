@@ -7,6 +7,7 @@ import itertools
 import os
 import shutil
 import tempfile
+import time
 import uuid
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from .. import _upcr
 from .._adapt import Adaptation, Errors, Pairs
 from .._cloud import packed
 from .._model import Model
-from ._pairs import _value
+from ._pairs import _value, warn_of_waiting
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     _Rows = list[npt.NDArray[np.float64]]
 
 _CHECKPOINT = "checkpoint.safetensors"
+_REPORTS_SHARE = 0.1
+"""Share of the time that reports of checkpoints may take; all workers wait for one, some two seconds."""
 
 
 def adapt(
@@ -68,21 +71,29 @@ def adapt(
         epochs, points, learning_rate, pairs, partial, fixed_pairs, seed: As for :func:`upcr.adapt`.
         name: The run's name; one that was stopped goes on under the same.
         storage_path: Where its checkpoints go: a place that all machines see, where there are several.
-        checkpoint_seconds: Time between checkpoints, from which the workers go on where one has died.
+        checkpoint_seconds: Time between checkpoints, from which the workers go on where one has died. It is longer where
+            a tenth of the time would not do for them.
         max_failures: How often they do.
 
     Raises:
         SettingError: There are fewer clouds than parts, or fewer parts than workers.
         ray.train.TrainingFailedError: A worker failed for good; its cause is the error.
     """
+    if not isinstance(clouds, ray.data.Dataset):
+        raise TypeError(f"clouds: a Ray dataset is needed, such as ray.data.from_items(), not {type(clouds).__name__}")
     parts = parts or workers
-    if not 0 < workers <= parts:
+    if workers < 1:
+        raise _upcr.SettingError(f"setting `workers`: must be 1 at least, not {workers}")
+    if workers > parts:
         raise _upcr.SettingError(f"setting `parts`: {workers} workers need as many at least, not {parts}")
     if weights is None:
         weights = Model.default()
     elif not isinstance(weights, Model):
         weights = Model.load(weights)
     # In memory once and in order, so that a part's rows are the same for whoever learns from it, and in the next run.
+    names = clouds.columns() or []
+    if column not in names:
+        raise _upcr.SettingError(f"there is no column {column}; there are {', '.join(names)}")
     rows = clouds.select_columns([column])
     rows.context.execution_options.preserve_order = True
     rows = rows.materialize()
@@ -109,6 +120,9 @@ def adapt(
             "checkpoint_seconds": checkpoint_seconds,
         },
     }
+    warn_of_waiting(workers * cpus_per_worker, "the workers")
+    if storage_path is not None and "://" not in storage_path:
+        storage_path = os.path.abspath(storage_path)
     trainer = DataParallelTrainer(
         _learn,
         train_loop_config=told,
@@ -122,6 +136,8 @@ def adapt(
     )
     result: Any = trainer.fit()
     found: dict[str, Any] = result.return_value
+    if "error" in found:
+        raise found["error"]
     model = Model.from_bytes(found.pop("model"))
     before, after = Errors(**found.pop("before")), Errors(**found.pop("after"))
     return Adaptation(model=model, before=before, after=after, **found)
@@ -134,25 +150,29 @@ def _learn(told: dict[str, Any]) -> dict[str, Any] | None:
     bounds = told["bounds"]
     parts = len(bounds) - 1
     own = range(rank * parts // workers, (rank + 1) * parts // workers)
-    clouds = [packed(cloud) for part in own for cloud in _clouds(told["blocks"][part], told["column"])]
     team = _Team(rank, workers)
-    with tempfile.TemporaryDirectory(prefix="upcr-") as folder:
-        stopped = ray.train.get_checkpoint()
-        if stopped is not None:
-            with stopped.as_directory() as kept:
-                shutil.copy(os.path.join(kept, _CHECKPOINT), folder)
-        member = {
-            "first_part": own.start,
-            "clouds_before": bounds[own.start],
-            "sizes": [bounds[part + 1] - bounds[part] for part in own],
-            "gather": team.gather,
-        }
-        team.checkpoint = os.path.join(folder, _CHECKPOINT)
-        team.seen = team.age()
-        weights = _upcr.Model.from_bytes(told["weights"])
-        found = _upcr.adapt(clouds, weights, folder, told["options"], team.hear, member)
-        found["model"] = found["model"].to_bytes()
-        return found if rank == 0 else None
+    try:
+        clouds = [packed(cloud) for part in own for cloud in _clouds(told["blocks"][part], told["column"])]
+        with tempfile.TemporaryDirectory(prefix="upcr-") as folder:
+            stopped = ray.train.get_checkpoint()
+            if stopped is not None:
+                with stopped.as_directory() as kept:
+                    shutil.copy(os.path.join(kept, _CHECKPOINT), folder)
+            member = {
+                "first_part": own.start,
+                "clouds_before": bounds[own.start],
+                "sizes": [bounds[part + 1] - bounds[part] for part in own],
+                "gather": team.gather,
+            }
+            team.checkpoint = os.path.join(folder, _CHECKPOINT)
+            team.seen = team.age()
+            weights = _upcr.Model.from_bytes(told["weights"])
+            found = _upcr.adapt(clouds, weights, folder, told["options"], team.hear, member)
+            found["model"] = found["model"].to_bytes()
+            return found if rank == 0 else None
+    except (_upcr.Error, OSError, TypeError) as error:
+        # To try again would not help: all end, and the first gives the error.
+        return {"error": team.failed(error)}
 
 
 def _clouds(blocks: list[ray.ObjectRef[Any]], column: str) -> Iterator[Any]:
@@ -169,15 +189,25 @@ class _Board:
         self.members = members
         self.rounds: dict[int, dict[int, Any]] = {}
         self.changed = asyncio.Condition()
+        self.failure: Exception | None = None
 
-    async def exchange(self, number: int, member: int, word: Any) -> list[Any]:
+    async def fail(self, error: Exception) -> Exception:
+        """Ends all rounds with the first error that a member has."""
+        async with self.changed:
+            self.failure = self.failure or error
+            self.changed.notify_all()
+            return self.failure
+
+    async def exchange(self, number: int, member: int, word: Any) -> list[Any] | Exception:
         async with self.changed:
             words = self.rounds.setdefault(number, {})
             words[member] = word
             # Who is in a round has done with the one before the last.
             self.rounds.pop(number - 2, None)
             self.changed.notify_all()
-            await self.changed.wait_for(lambda: len(words) == self.members)
+            await self.changed.wait_for(lambda: self.failure or len(words) == self.members)
+            if self.failure:
+                return self.failure
         return [words[rank] for rank in range(self.members)]
 
 
@@ -197,6 +227,7 @@ class _Team:
         self.last: dict[str, Any] = {}
         self.checkpoint = ""
         self.seen: float | None = None
+        self.reports_from = 0.0
         # Rows of this round and the last, which slower members may not have fetched yet.
         self.kept: list[Any] = []
 
@@ -214,14 +245,24 @@ class _Team:
     def gather(self, own: _Rows) -> _Rows:
         """All members' rows. Where the first has written a checkpoint, all report it: they agree by its word."""
         age = self.age() if self.rank == 0 else None
-        written = age is not None and age != self.seen
+        written = age is not None and age != self.seen and time.monotonic() >= self.reports_from
         rows = ray.put(own)
         self.kept = [*self.kept[-1:], rows]
         words = ray.get(self.board.exchange.remote(next(self.rounds), self.rank, (written, [rows])))
+        if isinstance(words, Exception):
+            raise words
         if words[0][0]:
             self.seen = age
+            start = time.monotonic()
             self.report()
+            end = time.monotonic()
+            self.reports_from = end + (end - start) / _REPORTS_SHARE
         return [row for rows in ray.get([rows for _, [rows] in words]) for row in rows]
+
+    def failed(self, error: Exception) -> Exception:
+        """Tells the others; gives the error that is all's."""
+        first: Exception = ray.get(self.board.fail.remote(error))
+        return first
 
     def report(self) -> None:
         """Hands Ray Train the checkpoint."""

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 import ray.data
 
-from .. import _upcr
+from .. import _settings, _upcr
 from .._cloud import PointCloud, read
 from .._register import register_batch
 from .._registration import Registration
@@ -63,18 +63,14 @@ class Registrar:
 
     def __init__(self, *, source: str = "source", target: str = "target", **settings: Unpack[Settings]) -> None:
         """Takes the names of the clouds' columns, and settings as :func:`upcr.register` has them."""
+        _upcr.check(_settings.packed(settings))
         self.source = source
         self.target = target
         self.settings = settings
 
     def __call__(self, pairs: pa.Table) -> pa.Table:
         """Registers every row of ``pairs``, whose columns :func:`register_pairs` describes."""
-        taken = sorted(set(SCHEMA.names) & set(pairs.column_names))
-        if taken:
-            raise _upcr.SettingError(f"columns that the result has too: {', '.join(taken)}; rename them")
-        for column in (self.source, self.target):
-            if column not in pairs.column_names:
-                raise _upcr.SettingError(f"there is no column {column}; there are {', '.join(pairs.column_names)}")
+        self.check(pairs.column_names)
         with tempfile.TemporaryDirectory(prefix="upcr-") as scratch:
             clouds = [self._pair(row, Path(scratch)) for row in _rows(pairs)]
             looked_at = [pair for pair in clouds if not isinstance(pair, Exception)]
@@ -86,6 +82,15 @@ class Registrar:
         for name in SCHEMA.names:
             kept = kept.append_column(SCHEMA.field(name), rows.column(name))
         return kept
+
+    def check(self, columns: list[str]) -> None:
+        """Refuses a table of these columns where one is missing, or has a name of the result's."""
+        taken = sorted(set(SCHEMA.names) & set(columns))
+        if taken:
+            raise _upcr.SettingError(f"columns that the result has too: {', '.join(taken)}; rename them")
+        for column in (self.source, self.target):
+            if column not in columns:
+                raise _upcr.SettingError(f"there is no column {column}; there are {', '.join(columns)}")
 
     def _pair(self, row: Mapping[str, Any], scratch: Path) -> tuple[Any, Any, Any] | Exception:
         """A row's clouds and first guess as ``register_batch`` takes them, or what is wrong with them."""
@@ -112,7 +117,8 @@ def register_pairs(
         pairs: Rows with the columns ``source`` and ``target``: names of files (which all workers can read; or URIs that
             Arrow's file systems know, such as ``s3://``), or points of shape (N, 3). Further columns that are looked at
             where they are there: ``init`` (a first guess, shape (4, 4), or a file with one), ``source_viewpoint`` and
-            ``target_viewpoint`` (shape (3,)). All columns are kept but the clouds' own where they are points.
+            ``target_viewpoint`` (shape (3,)). All columns are kept but the clouds' own where they are points;
+            none may have a name of :data:`SCHEMA`'s.
         source: Name of the column of the clouds that are moved.
         target: Name of the column of those that stay.
         workers: Processes that register; else as many as find room.
@@ -125,11 +131,19 @@ def register_pairs(
         A row for each pair, with the columns of :data:`SCHEMA`, in blocks of ``batch_size``: ``write_parquet`` makes a
         file of each where its ``min_rows_per_file`` does not say otherwise.
     """
+    if not isinstance(pairs, ray.data.Dataset):
+        raise TypeError(f"pairs: a Ray dataset is needed, such as read_pairs() or ray.data.from_items(), not {type(pairs).__name__}")
     if "threads" in settings:
         raise _upcr.SettingError("setting `threads`: a worker's are told by `cpus_per_worker`")
-    if workers and ray.is_initialized() and workers * cpus_per_worker >= ray.cluster_resources().get("CPU", 0):
-        text = "the workers take all of the cluster's processors: unless it grows, none is left for reading and writing"
-        warnings.warn(text, stacklevel=2)
+    for name, value in (("workers", workers), ("cpus_per_worker", cpus_per_worker), ("batch_size", batch_size)):
+        if value is not None and value < 1:
+            raise _upcr.SettingError(f"setting `{name}`: must be 1 at least, not {value}")
+    # Now, not when the job has started.
+    registrar = Registrar(source=source, target=target, **settings)
+    known = pairs.schema(fetch_if_missing=False)
+    if known is not None:
+        registrar.check(known.names)
+    warn_of_waiting((workers or 1) * cpus_per_worker + 1, "the workers, and reading and writing,")
     pool = ray.data.ActorPoolStrategy(size=workers) if workers else ray.data.ActorPoolStrategy(min_size=1)
     # Ray's blocks are as large as memory likes, and a block is what a worker is handed and what is done again.
     return pairs.repartition(target_num_rows_per_block=batch_size).map_batches(
@@ -140,6 +154,15 @@ def register_pairs(
         compute=pool,
         num_cpus=cpus_per_worker,
     )
+
+
+def warn_of_waiting(needed: int, who: str) -> None:
+    """Warns where the cluster has fewer processors than are needed at once."""
+    if ray.is_initialized():
+        there = int(ray.cluster_resources().get("CPU", 0))
+        if there < needed:
+            text = f"{who} need {needed} processors, and there are {there}: unless the cluster grows, they wait for ever"
+            warnings.warn(text, stacklevel=3)
 
 
 def read_pairs(path: str | os.PathLike[str]) -> ray.data.Dataset:
