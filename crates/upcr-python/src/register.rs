@@ -15,6 +15,7 @@ use upcr::{
     Alternative, Evidence, FreeDirection, PointCloud, Progress, Registration, Rigid, Settings, Timings,
     Watch, register_watched,
 };
+use upcr_lab::data::share;
 
 use crate::call::{Caller, Place, own_pool, pool, run};
 use crate::cloud::{Input, array, cloud_exception, viewpoint};
@@ -91,8 +92,8 @@ impl Found {
 fn spread(cloud: &PointCloud) -> Vec<[f64; 3]> {
     let (all, kept) = (cloud.len(), cloud.len().min(PICTURED));
     let place = |i: usize| {
-        let (from, to) = (i * all / kept, (i + 1) * all / kept);
-        from + i.wrapping_mul(0x9e37_79b9) % (to - from)
+        let near = share(all, i, kept);
+        near.start + i.wrapping_mul(0x9e37_79b9) % near.len()
     };
     (0..kept).map(|i| cloud.points[place(i)]).collect()
 }
@@ -263,9 +264,8 @@ impl Batch {
                 caller.tell(());
             }
         };
-        // As even as it goes.
-        let share = |w: usize| (w + 1) * threads / workers - w * threads / workers;
-        let pools: Vec<_> = (0..workers).map(|w| own_pool(share(w))).collect::<PyResult<_>>()?;
+        let pools: Vec<_> =
+            (0..workers).map(|w| own_pool(share(threads, w, workers).len())).collect::<PyResult<_>>()?;
         thread::scope(|scope| {
             for pool in &pools {
                 scope.spawn(|| pool.install(work));

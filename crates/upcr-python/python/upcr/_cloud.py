@@ -147,14 +147,15 @@ def write(
 
 def packed(cloud: CloudLike, name: str = "points", *, normals: bool = False, colors: bool = False) -> _Packed:
     """The cloud as the native half takes it: a file's name, or C-contiguous arrays, with what else is asked for."""
+    # Arrays first: to ask what is a path takes longer than all else that is done for them.
+    if isinstance(cloud, np.ndarray):
+        return _rows(cloud, np.float64, name), None, None, None
     if isinstance(cloud, (str, os.PathLike)):
         return os.fspath(cloud)
     return _arrays(cloud, name, normals=normals, colors=colors)
 
 
 def _arrays(cloud: Any, name: str = "points", *, normals: bool, colors: bool) -> _Arrays:
-    if isinstance(cloud, np.ndarray):
-        return _rows(cloud, np.float64, name), None, None, None
     if hasattr(cloud, "to_legacy"):
         # Open3D's clouds of tensors.
         cloud = cloud.to_legacy()

@@ -54,13 +54,13 @@ class Settings(TypedDict, total=False):
 def packed(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings that are told, as the native half takes them."""
     told = {name: value for name, value in settings.items() if value is not None}
-    if isinstance(told.get("network"), Model):
-        told["network"] = told["network"]._native
+    if "network" in told:
+        network = told["network"]
+        told["network"] = network._native if isinstance(network, Model) else os.fspath(network)
+    if "calibration" in told:
+        told["calibration"] = os.fspath(told["calibration"])
     if "init" in told:
         told["init"] = pose(told["init"])
-    for name in ("calibration", "network"):
-        if isinstance(told.get(name), os.PathLike):
-            told[name] = os.fspath(told[name])
     if "locks" in told and not isinstance(told["locks"], str):
         told["locks"] = list(told["locks"])
     return told

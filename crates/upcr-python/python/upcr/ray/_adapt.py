@@ -100,6 +100,7 @@ def adapt(
     count = rows.count()
     if count < parts:
         raise _upcr.SettingError(f"setting `parts`: {count} clouds make no {parts} parts")
+    # The parts that one machine makes of as many clouds (`Shapes::in_parts`).
     bounds = [part * count // parts for part in range(parts + 1)]
     blocks = [part.to_arrow_refs() for part in rows.split_at_indices(bounds[1:-1])] if parts > 1 else [rows.to_arrow_refs()]
     told = {
