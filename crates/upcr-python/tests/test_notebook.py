@@ -49,3 +49,13 @@ def test_words_are_escaped() -> None:
 
     line = np.c_[np.arange(10.0), np.zeros((10, 2))]
     assert "<b>" not in page([("a", "<b>")], (line, line), np.eye(4))
+
+
+def test_far_points_leave_the_picture_to_the_others() -> None:
+    from upcr._picture import _frame
+
+    cloud = np.random.default_rng(0).uniform(-1, 1, (1000, 2))
+    low, high = _frame(cloud)
+    assert (low == cloud.min(axis=0)).all() and (high == cloud.max(axis=0)).all()
+    low, high = _frame(np.concatenate([cloud, [[90.0, 0.0], [0.0, -90.0]]]))
+    assert (low > -2).all() and (high < 2).all()

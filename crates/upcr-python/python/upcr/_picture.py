@@ -16,7 +16,7 @@ _SOURCE, _TARGET = "#d95f02", "#4477aa"
 def page(lines: list[tuple[str, str]], clouds: tuple[FloatArray, FloatArray], pose: FloatArray) -> str:
     """A result as HTML; ``clouds`` are points of source and target, shape (N, 3), ``pose`` is the one found, (4, 4)."""
     rows = "".join(
-        f'<tr><td style="text-align:left">{escape(name)}</td><td style="text-align:left">{escape(value)}</td></tr>'
+        f'<tr><td style="text-align:left;padding-right:1em">{escape(name)}</td><td style="text-align:left">{escape(value)}</td></tr>'
         for name, value in lines
     )
     return f"<div>{drawing(clouds, pose)}<table>{rows}</table></div>"
@@ -44,13 +44,21 @@ def drawing(clouds: tuple[FloatArray, FloatArray], pose: FloatArray) -> str:
     )
 
 
+def _frame(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Corners of what is drawn: all, but for the few far points that a lidar sees, beside which the rest would be a dot."""
+    low, high = np.percentile(points, (3, 97), axis=0)
+    beyond = (high - low) / 4
+    return np.maximum(points.min(axis=0), low - beyond), np.minimum(points.max(axis=0), high + beyond)
+
+
 def _panel(title: str, clouds: list[FloatArray], x: int) -> str:
     both = np.concatenate(clouds)
-    low, high = both.min(axis=0), both.max(axis=0)
+    low, high = _frame(both)
     length = float((high - low).max()) or 1.0
     scale = (_SIZE - 2 * _MARGIN) / length
     paths = []
     for cloud, color in zip(clouds, (_TARGET, _SOURCE), strict=True):
+        cloud = cloud[((cloud >= low) & (cloud <= high)).all(axis=1)]
         at = np.rint((cloud - (low + high) / 2) * (scale, -scale) + (x + _SIZE / 2, _SIZE / 2)).astype(int)
         dots = "".join(f"M{column} {row}h0" for column, row in np.unique(at, axis=0).tolist())
         paths.append(f'<path d="{dots}" stroke="{color}" stroke-width="2" stroke-linecap="round" stroke-opacity=".7"/>')
