@@ -1,0 +1,52 @@
+/** Elements. Words become text nodes, never markup. */
+
+type Child = Node | string | null;
+type Attributes = Record<string, string | number | boolean>;
+
+export function el<K extends keyof HTMLElementTagNameMap>(
+  tag: K, attributes: Attributes = {}, ...children: readonly Child[]
+): HTMLElementTagNameMap[K] {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (value === true) element.setAttribute(name, "");
+    else if (value !== false) element.setAttribute(name, String(value));
+  }
+  element.append(...children.filter((child) => child !== null));
+  return element;
+}
+
+export function button(label: string, act: () => void, attributes: Attributes = {}): HTMLButtonElement {
+  const made = el("button", { type: "button", ...attributes }, label);
+  made.addEventListener("click", act);
+  return made;
+}
+
+/** Buttons of which one is pressed. */
+export function choice<T extends string>(
+  label: string, options: readonly (readonly [T, string])[], first: T, chosen: (value: T) => void,
+): { element: HTMLElement; choose: (value: T) => void; value: () => T } {
+  let now = first;
+  const buttons = options.map(([value, name]) => [value, button(name, () => choose(value))] as const);
+  const show = () => buttons.forEach(([value, b]) => b.setAttribute("aria-pressed", String(value === now)));
+  const choose = (value: T) => {
+    now = value;
+    show();
+    chosen(value);
+  };
+  show();
+  return {
+    element: el("div", { class: "choice", role: "group", "aria-label": label }, ...buttons.map(([, b]) => b)),
+    choose,
+    value: () => now,
+  };
+}
+
+/** Numbers with as many digits as say something. */
+export function number(value: number): string {
+  if (value === 0) return "0";
+  return Math.abs(value) < 1e-4 ? value.toExponential(3) : value.toLocaleString("en", { maximumSignificantDigits: 4 });
+}
+
+export function count(value: number): string {
+  return value.toLocaleString("en");
+}

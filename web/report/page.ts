@@ -1,0 +1,99 @@
+/** What a page holds: the words as JSON, the points as base64, each in an element that nothing runs. */
+
+import type { Cloud, Distances, Rows, Triple } from "@upcr/viewer";
+
+/** The notations of a pose, from the name shown to the text copied. */
+export interface Pose {
+  T_target_source: Rows;
+  /** Against the pose found, of an alternative. */
+  relative_score: number | null;
+  notations: readonly { name: string; about: string; text: string }[];
+}
+
+export interface CloudInfo {
+  name: string;
+  /** In the file, and in this page. */
+  points: number;
+  shown: number;
+  /** Without finite coordinates. */
+  left_out: number;
+  /** Corner of the box and length of a step: what the numbers in the page are told in. */
+  origin: Triple;
+  step: number;
+  colors: boolean;
+}
+
+export interface Registration {
+  fitness: number;
+  inlier_rmse: number;
+  num_inliers: number;
+  converged: boolean;
+  iterations: number;
+  probability: number;
+  method: string;
+  voxel_size: number;
+  points_used: readonly [number, number];
+  settings: Record<string, unknown>;
+  timings_ms: Record<string, number>;
+}
+
+export interface Page {
+  version: string;
+  clouds: readonly CloudInfo[];
+  /** The one found or given, and after it the alternatives. None: there is nothing but before. */
+  poses: readonly Pose[];
+  /** `distances-0` of the clouds as they lie, `distances-1` and so on of the poses. */
+  distances: { reach: number; range: number } | null;
+  verdict: {
+    registered: boolean;
+    threshold: number;
+    reasons: readonly { name: string; text: string }[];
+    free: readonly string[];
+    source_scale: number | null;
+  } | null;
+  registration: Registration | null;
+}
+
+function text(id: string): string {
+  const element = document.getElementById(id);
+  const held = element?.textContent ?? "";
+  element?.remove();
+  return held;
+}
+
+function bytes(id: string): Uint8Array<ArrayBuffer> {
+  const binary = atob(text(id));
+  const out = new Uint8Array(binary.length);
+  for (let i = 0; i < out.length; i += 1) out[i] = binary.charCodeAt(i);
+  return out;
+}
+
+export function readPage(): Page {
+  return JSON.parse(text("page")) as Page;
+}
+
+/** Points are three numbers of three bytes each, the lowest first. */
+export function readCloud(info: CloudInfo, index: number): Cloud {
+  const packed = bytes(`points-${index}`);
+  const positions = new Float32Array(packed.length / 3);
+  for (let i = 0, at = 0; i < positions.length; i += 1, at += 3) {
+    positions[i] = ((packed[at] ?? 0) | ((packed[at + 1] ?? 0) << 8) | ((packed[at + 2] ?? 0) << 16)) * info.step;
+  }
+  return { positions, origin: info.origin, colors: info.colors ? bytes(`colors-${index}`) : null };
+}
+
+/** Told once each: the elements are gone after that. */
+const read = new Map<number, Distances>();
+
+/** Distances at pose `index`, of which 0 is where the clouds lie. */
+export function readDistances(page: Page, index: number): Distances | null {
+  if (!page.distances) return null;
+  let held = read.get(index);
+  if (!held) {
+    const packed = bytes(`distances-${index}`);
+    const values = Uint16Array.from({ length: packed.length / 2 }, (_, i) => (packed[2 * i] ?? 0) | ((packed[2 * i + 1] ?? 0) << 8));
+    held = { values, reach: page.distances.reach };
+    read.set(index, held);
+  }
+  return held;
+}
