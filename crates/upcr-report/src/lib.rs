@@ -1,0 +1,12 @@
+//! A registration as one HTML page: both clouds in 3-D before and after, the verdict, the pose to copy. The page is one
+//! file, opens without a network, and has none: what it may run is the one script that it holds, told by its hash.
+//!
+//! The script is built from `web/` in the repository and kept in `assets/`, so that building this crate needs no Node.
+
+mod display;
+mod notation;
+mod page;
+
+pub use display::MOST_POINTS;
+pub use notation::{Notation, notations};
+pub use page::Page;

@@ -1,0 +1,300 @@
+//! The page: words as JSON, points as base64, and the script that draws them.
+
+use std::fmt::Write;
+
+use serde::Serialize;
+use upcr::{PointCloud, Registration, Result, Rigid, TRUSTWORTHY};
+
+use crate::display::{Displayed, MOST_POINTS, Surface, range};
+use crate::notation::{Notation, notations};
+
+const SCRIPT: &str = include_str!("../assets/viewer.js");
+const SCRIPT_SHA256: &str = include_str!("../assets/viewer.sha256");
+
+/// Clouds, and what is known of the pose that lays the first on the second.
+#[derive(Debug, Clone)]
+pub struct Page<'a> {
+    clouds: Vec<(&'a str, &'a PointCloud)>,
+    poses: Vec<(Rigid, Option<f64>)>,
+    found: Option<&'a Registration>,
+    most_points: usize,
+}
+
+#[derive(Serialize)]
+struct Told<'a> {
+    version: &'static str,
+    clouds: Vec<ToldCloud<'a>>,
+    poses: Vec<ToldPose>,
+    distances: Option<ToldDistances>,
+    verdict: Option<ToldVerdict<'a>>,
+    registration: Option<&'a Registration>,
+}
+
+#[derive(Serialize)]
+struct ToldCloud<'a> {
+    name: &'a str,
+    points: usize,
+    shown: usize,
+    left_out: usize,
+    origin: [f64; 3],
+    step: f64,
+    colors: bool,
+}
+
+#[derive(Serialize)]
+struct ToldPose {
+    T_target_source: Rigid,
+    relative_score: Option<f64>,
+    notations: Vec<Notation>,
+}
+
+#[derive(Serialize)]
+struct ToldDistances {
+    reach: f64,
+    range: f64,
+}
+
+#[derive(Serialize)]
+struct ToldVerdict<'a> {
+    registered: bool,
+    threshold: f64,
+    reasons: Vec<ToldReason<'a>>,
+    free: Vec<String>,
+    source_scale: Option<f64>,
+}
+
+#[derive(Serialize)]
+struct ToldReason<'a> {
+    name: &'a upcr::Reason,
+    text: String,
+}
+
+impl<'a> Page<'a> {
+    /// Of clouds as they lie, each with its name.
+    pub fn of_clouds(clouds: &[(&'a str, &'a PointCloud)]) -> Self {
+        Self { clouds: clouds.to_vec(), poses: Vec::new(), found: None, most_points: MOST_POINTS }
+    }
+
+    /// Of a registration: its pose and the alternatives, the verdict, the settings, the times.
+    pub fn of_registration(
+        source: (&'a str, &'a PointCloud),
+        target: (&'a str, &'a PointCloud),
+        found: &'a Registration,
+    ) -> Self {
+        let others = found.alternatives.iter().map(|a| (a.T_target_source, Some(a.relative_score)));
+        let poses = std::iter::once((found.T_target_source, None)).chain(others).collect();
+        Self { poses, found: Some(found), ..Self::of_clouds(&[source, target]) }
+    }
+
+    /// With a pose that moves the first cloud.
+    #[must_use]
+    pub fn with_pose(mut self, pose: &Rigid) -> Self {
+        self.poses = vec![(*pose, None)];
+        self
+    }
+
+    /// Thinned to so many points a cloud, where there are more.
+    #[must_use]
+    pub fn with_most_points(mut self, most: usize) -> Self {
+        self.most_points = most.max(1);
+        self
+    }
+
+    /// The page.
+    ///
+    /// # Errors
+    /// [`upcr::Error::TooFewPoints`] where a cloud has no point with finite coordinates.
+    pub fn html(&self) -> Result<String> {
+        let shown: Vec<Displayed> = self
+            .clouds
+            .iter()
+            .map(|(_, cloud)| Displayed::new(cloud, self.most_points))
+            .collect::<Result<_>>()?;
+        let mut blobs: Vec<(String, Vec<u8>)> = Vec::new();
+        let mut clouds = Vec::new();
+        for (i, ((name, cloud), shown)) in self.clouds.iter().zip(&shown).enumerate() {
+            blobs.push((format!("points-{i}"), shown.packed()));
+            let colors = shown.colors();
+            clouds.push(ToldCloud {
+                name,
+                points: cloud.len(),
+                shown: shown.chosen.len(),
+                left_out: shown.left_out,
+                origin: shown.origin,
+                step: shown.step,
+                colors: colors.is_some(),
+            });
+            blobs.extend(colors.map(|colors| (format!("colors-{i}"), colors)));
+        }
+
+        let surface = match &shown[..] {
+            [_, target, ..] => Surface::new(self.clouds[1].1, target),
+            _ => None,
+        };
+        let distances = surface.map(|surface| {
+            let lying = [Rigid::identity()];
+            let poses = lying.iter().chain(self.poses.iter().map(|(pose, _)| pose));
+            let told: Vec<Vec<u16>> = poses.map(|pose| surface.distances(&shown[0], pose)).collect();
+            let shown_first = &told[usize::from(told.len() > 1)];
+            let range = range(self.found.map(|f| f.voxel_size), shown_first, surface.reach);
+            for (i, told) in told.iter().enumerate() {
+                blobs.push((format!("distances-{i}"), told.iter().flat_map(|d| d.to_le_bytes()).collect()));
+            }
+            ToldDistances { reach: surface.reach, range }
+        });
+        let told = Told {
+            version: env!("CARGO_PKG_VERSION"),
+            clouds,
+            poses: self.poses.iter().map(|&(pose, score)| told_pose(pose, score)).collect(),
+            distances,
+            verdict: self.found.map(told_verdict),
+            registration: self.found,
+        };
+        Ok(assemble(&told, &blobs))
+    }
+}
+
+fn told_pose(T_target_source: Rigid, relative_score: Option<f64>) -> ToldPose {
+    ToldPose { T_target_source, relative_score, notations: notations(&T_target_source) }
+}
+
+fn told_verdict(found: &Registration) -> ToldVerdict<'_> {
+    ToldVerdict {
+        registered: found.is_trustworthy(),
+        threshold: TRUSTWORTHY,
+        reasons: found.reasons.iter().map(|name| ToldReason { name, text: name.to_string() }).collect(),
+        free: found.free_directions.iter().map(ToString::to_string).collect(),
+        source_scale: found.source_scale,
+    }
+}
+
+fn assemble(told: &Told, blobs: &[(String, Vec<u8>)]) -> String {
+    let size: usize = blobs.iter().map(|(_, bytes)| 4 * bytes.len().div_ceil(3) + 64).sum();
+    let mut html = String::with_capacity(SCRIPT.len() + size + (1 << 16));
+    // No other script runs, and nothing is fetched: not from elsewhere, and not from where the page came from.
+    let _ = write!(
+        html,
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <meta name=\"color-scheme\" content=\"light dark\">\n\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'sha256-{SCRIPT_SHA256}'; \
+         base-uri 'none'; form-action 'none'\">\n<title>UPCR</title>\n</head>\n<body>\n\
+         <noscript>The clouds are drawn by the page's own script, and scripts are turned off here.</noscript>\n\
+         <script type=\"application/json\" id=\"page\">{}</script>\n",
+        json(told)
+    );
+    for (id, bytes) in blobs {
+        let _ = write!(html, "<script type=\"text/plain\" id=\"{id}\">");
+        base64(bytes, &mut html);
+        html.push_str("</script>\n");
+    }
+    let _ = write!(html, "<script>{SCRIPT}</script>\n</body>\n</html>\n");
+    html
+}
+
+/// JSON without a character that means something to HTML, or ends a line of a script.
+fn json(value: &impl Serialize) -> String {
+    // Numbers, text and lists always become JSON.
+    let plain = serde_json::to_string(value).unwrap_or_default();
+    let mut text = String::with_capacity(plain.len());
+    for c in plain.chars() {
+        match c {
+            '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => {
+                let _ = write!(text, "\\u{:04x}", u32::from(c));
+            }
+            _ => text.push(c),
+        }
+    }
+    text
+}
+
+fn base64(bytes: &[u8], text: &mut String) {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    for three in bytes.chunks(3) {
+        let number = (0..3).fold(0, |n, k| n << 8 | u32::from(three.get(k).copied().unwrap_or(0)));
+        for k in 0..4 {
+            let digit = DIGITS[(number >> (18 - 6 * k) & 63) as usize];
+            text.push(if k > three.len() { '=' } else { char::from(digit) });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use upcr::{Settings, register};
+
+    use super::*;
+
+    const HOSTILE: &str = "</script><script>alert(1)</script><!--<img src=x onerror=alert(2)>&amp;\u{2028}.ply";
+
+    fn cloud(shift: usize) -> PointCloud {
+        let point = |i: usize| {
+            let (u, v) = (0.02 * ((i + shift) % 70) as f64, 0.03 * (i / 70) as f64);
+            [u, v, (3.0 * u).sin() + 0.3 * (5.0 * v + u).cos()]
+        };
+        PointCloud::from_points((0..4000).map(point).collect())
+    }
+
+    /// What the page tells, and the names of what it holds.
+    fn read(html: &str) -> (serde_json::Value, Vec<&str>) {
+        let start = "id=\"page\">";
+        let from = html.find(start).unwrap() + start.len();
+        let text = &html[from..from + html[from..].find("</script>").unwrap()];
+        let ids = html.split("type=\"text/plain\" id=\"").skip(1).map(|t| t.split('"').next().unwrap());
+        (serde_json::from_str(text).unwrap(), ids.collect())
+    }
+
+    #[test]
+    fn a_page_tells_all_that_the_registration_does() {
+        let (a, b) = (cloud(0), cloud(3));
+        let found = register(&a, &b, &Settings::default()).unwrap();
+        let html = Page::of_registration(("a.ply", &a), ("b.ply", &b), &found).html().unwrap();
+        let (told, ids) = read(&html);
+        assert_eq!(told["registration"], serde_json::to_value(&found).unwrap());
+        assert_eq!(told["poses"].as_array().unwrap().len(), 1 + found.alternatives.len());
+        assert_eq!(told["verdict"]["registered"], found.is_trustworthy());
+        assert_eq!(told["clouds"][0]["shown"], 4000);
+        assert!(ids.starts_with(&["points-0", "points-1", "distances-0", "distances-1"]), "{ids:?}");
+    }
+
+    #[test]
+    fn names_are_data_never_markup() {
+        let cloud = cloud(0);
+        let html = Page::of_clouds(&[(HOSTILE, &cloud), ("b", &cloud)]).html().unwrap();
+        let (told, _) = read(&html);
+        assert_eq!(told["clouds"][0]["name"], HOSTILE);
+        assert!(!html.contains("alert(1)</script>") && !html.contains("<img") && !html.contains('\u{2028}'));
+        let scripts = html.matches("<script").count();
+        assert_eq!(scripts, html.matches("</script>").count());
+        // The words, two clouds, the distances as they lie, the script.
+        assert_eq!(scripts, 5);
+    }
+
+    #[test]
+    fn no_script_but_the_one_inside_may_run_and_nothing_is_fetched() {
+        let cloud = cloud(0);
+        let html = Page::of_clouds(&[("a", &cloud)]).html().unwrap();
+        assert!(html.contains("default-src 'none'; script-src 'sha256-"));
+        assert!(!SCRIPT.contains("</script") && !SCRIPT.contains("<!--") && !SCRIPT.contains('\r'));
+        assert_eq!(SCRIPT_SHA256.len(), 44);
+    }
+
+    #[test]
+    fn thinning_is_told() {
+        let cloud = cloud(0);
+        let page = Page::of_clouds(&[("a", &cloud)]).with_most_points(100).with_pose(&Rigid::identity());
+        let html = page.html().unwrap();
+        let (told, ids) = read(&html);
+        assert_eq!((&told["clouds"][0]["points"], &told["clouds"][0]["shown"]), (&4000.into(), &100.into()));
+        assert_eq!(ids, ["points-0"]);
+    }
+
+    #[test]
+    fn known_base64() {
+        for (bytes, text) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")] {
+            let mut told = String::new();
+            base64(bytes.as_bytes(), &mut told);
+            assert_eq!(told, text);
+        }
+    }
+}
