@@ -115,7 +115,8 @@ export class Viewer {
   #moving = false;
   #stillAt = 0;
   #timer = 0;
-  #lastFrame = 0;
+  #drawing = false;
+  #waiting = false;
   #asked = false;
   #reach = 0;
   #distances: Record<Side, BufferAttribute | null> = { before: null, after: null };
@@ -168,6 +169,8 @@ export class Viewer {
       this.onTrouble("The graphics driver gave up the picture. It comes back by itself where it can; else load the page again.");
     });
     this.canvas.addEventListener("webglcontextrestored", () => {
+      // Of all that was set, three.js forgets this.
+      this.#renderer.setClearColor(new Color(this.#palette.background));
       this.onTrouble(null);
       this.draw();
     });
@@ -307,7 +310,6 @@ export class Viewer {
 
   /** The view moves: fewer points are drawn, if that many take too long. */
   #move(): void {
-    if (!this.#moving) this.#lastFrame = 0;
     this.#moving = true;
     this.#stillAt = performance.now() + STILL;
     if (this.#timer === 0) this.#timer = window.setTimeout(() => this.#rest(), STILL);
@@ -363,7 +365,33 @@ export class Viewer {
     return apart;
   }
 
+  /** Waits until the frame is drawn, and learns from how long that took how much of the clouds can be drawn in time. */
+  #watch(share: number): void {
+    const gl = this.#renderer.getContext() as WebGL2RenderingContext;
+    const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    if (!sync) return;
+    gl.flush();
+    this.#drawing = true;
+    const start = performance.now();
+    const look = () => {
+      if (!gl.isContextLost() && gl.getSyncParameter(sync, gl.SYNC_STATUS) !== gl.SIGNALED) {
+        requestAnimationFrame(look);
+        return;
+      }
+      gl.deleteSync(sync);
+      this.#drawing = false;
+      const took = performance.now() - start;
+      if (took > SLOW) this.#share = Math.max((share * SLOW) / took, 0.001);
+      else if (took < FAST && share === this.#share) this.#share = Math.min(1.15 * share, 1);
+      if (this.#waiting) this.draw();
+    };
+    requestAnimationFrame(look);
+  }
+
   #frame(now: number): void {
+    // Frames do not queue up behind a slow one: the next shows what is wanted then.
+    this.#waiting = this.#drawing;
+    if (this.#waiting) return;
     const { clientWidth: width, clientHeight: height } = this.canvas.parentElement ?? this.canvas;
     if (width === 0 || height === 0) return;
     const ratio = Math.min(window.devicePixelRatio, 2);
@@ -379,15 +407,10 @@ export class Viewer {
       progress = t * t * (3 - 2 * t);
     }
     const busy = this.#moving || this.#flight !== null;
-    if (busy && this.#lastFrame > 0) {
-      const took = now - this.#lastFrame;
-      if (took > SLOW) this.#share = Math.max(this.#share * Math.max(0.4, SLOW / took), 0.001);
-      else if (took < FAST) this.#share = Math.min(this.#share * 1.15, 1);
-    }
-    this.#lastFrame = now;
+    const share = busy ? this.#share : 1;
     for (const { geometry } of this.#drawn) {
       const count = geometry.getAttribute("position").count;
-      geometry.setDrawRange(0, busy ? Math.min(count, Math.max(FEWEST, Math.ceil(this.#share * count))) : count);
+      geometry.setDrawRange(0, Math.min(count, Math.max(FEWEST, Math.ceil(share * count))));
     }
 
     const goal = this.#placement(this.#side);
@@ -415,6 +438,7 @@ export class Viewer {
     } else {
       this.#pane(this.#side, this.#shown.placement, this.#shown.home, 0, 0, width, height, ratio);
     }
+    this.#watch(share);
     if (progress < 1) this.draw();
     else if (this.#flight) {
       this.#flight = null;

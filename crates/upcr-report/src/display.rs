@@ -107,8 +107,11 @@ impl Surface {
         let reach = REACH * most[0].hypot(most[1]).hypot(most[2]);
         let measurable = |v: f64| (v * v) as f32 > 0.0 && (v * v) < f64::from(f32::MAX);
         // Wherever squares of single precision hold the whole cloud and a thousandth of what is to be told.
-        (measurable(1e-3 * reach) && measurable(reach / REACH))
-            .then(|| Self { tree: KdTree::new(&points), origin, reach })
+        (measurable(1e-3 * reach) && measurable(reach / REACH)).then(|| Self {
+            tree: KdTree::new(&points),
+            origin,
+            reach,
+        })
     }
 
     /// Distances of the displayed points, moved by `pose`, in 65535ths of the reach.
@@ -131,7 +134,11 @@ pub(crate) fn range(voxel_size: Option<f64>, distances: &[u16], reach: f64) -> f
     let usual = || {
         let mut within: Vec<u16> = distances.iter().copied().filter(|&d| d < u16::MAX).collect();
         let middle = within.len() / 2;
-        if within.is_empty() { reach } else { reach * f64::from(*within.select_nth_unstable(middle).1) / f64::from(u16::MAX) }
+        if within.is_empty() {
+            reach
+        } else {
+            reach * f64::from(*within.select_nth_unstable(middle).1) / f64::from(u16::MAX)
+        }
     };
     let wished = voxel_size.filter(|&v| v > 0.0).unwrap_or_else(usual) * 3.0;
     wished.clamp(1e-3 * reach, reach)

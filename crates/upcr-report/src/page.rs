@@ -225,7 +225,8 @@ mod tests {
 
     use super::*;
 
-    const HOSTILE: &str = "</script><script>alert(1)</script><!--<img src=x onerror=alert(2)>&amp;\u{2028}.ply";
+    const HOSTILE: &str =
+        "</script><script>alert(1)</script><!--<img src=x onerror=alert(2)>&amp;\u{2028}.ply";
 
     fn cloud(shift: usize) -> PointCloud {
         let point = |i: usize| {
@@ -291,7 +292,9 @@ mod tests {
 
     #[test]
     fn known_base64() {
-        for (bytes, text) in [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")] {
+        for (bytes, text) in
+            [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")]
+        {
             let mut told = String::new();
             base64(bytes.as_bytes(), &mut told);
             assert_eq!(told, text);
