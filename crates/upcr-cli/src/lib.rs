@@ -19,6 +19,7 @@ mod reproduce;
 mod synth;
 #[cfg(feature = "train")]
 mod train;
+mod view;
 
 use std::ffi::OsString;
 
@@ -68,6 +69,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Register(register::Args),
+    View(view::Args),
     Features(features::Args),
     Synth(synth::Args),
     Convert(convert::Args),
@@ -97,6 +99,7 @@ pub fn run(args: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> Statu
     };
     let outcome = match cli.command {
         Command::Register(args) => register::run(&args),
+        Command::View(args) => view::run(&args),
         Command::Features(args) => features::run(&args),
         Command::Synth(args) => synth::run(&args),
         Command::Convert(args) => convert::run(&args),

@@ -17,6 +17,8 @@ use upcr::{
     Calibration, Locks, Method, PointCloud, Refinement, Registration, Rigid, RobustKernel, Settings, Watch,
     io,
 };
+use upcr_lab::files::write_atomically;
+use upcr_report::Page;
 
 use crate::output::{self, Progress};
 use crate::{Status, describe, input};
@@ -33,7 +35,7 @@ pub struct Args {
     target: Option<PathBuf>,
     /// Register many pairs: a file (`-`: stdin) with SOURCE, TARGET and, if any, the first guess's file on each
     /// line, separated by tabs or blanks. Prints one JSON object a line, in the same order, as soon as it is known
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["source", "target", "init", "output", "transform"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["source", "target", "init", "output", "transform", "report"])]
     pairs: Option<PathBuf>,
     /// Where the first pose comes from
     #[arg(long, value_enum, default_value_t = Settings::default().method)]
@@ -85,6 +87,10 @@ pub struct Args {
     /// Write the pose as a text file with a 4x4 row-major matrix
     #[arg(long, value_name = "FILE")]
     transform: Option<PathBuf>,
+    /// Write a report: one HTML page, which needs no network, with both clouds in 3-D before and after, the verdict, the
+    /// alternatives, and the pose to copy
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
     /// Print one JSON object instead of a summary
     #[arg(long)]
     json: bool,
@@ -173,7 +179,7 @@ pub fn run(args: &Args) -> Result<Status> {
 
 fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status> {
     let settings = args.settings()?;
-    for path in [&args.transform, &args.output].into_iter().flatten() {
+    for path in [&args.transform, &args.output, &args.report].into_iter().flatten() {
         output::check_folder(path)?;
     }
     if let Some(path) = &args.output {
@@ -191,6 +197,11 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status
     }
     if let Some(path) = &args.output {
         io::write_cloud(path, &source.transformed(&found.T_target_source))?;
+    }
+    if let Some(path) = &args.report {
+        let [a, b] = [source_path, target_path].map(|path| path.display().to_string());
+        let page = Page::of_registration((&a, &source), (&b, &target), &found);
+        write_atomically(path, page.html()?.as_bytes())?;
     }
     drop(progress);
 

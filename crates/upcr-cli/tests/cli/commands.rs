@@ -263,3 +263,22 @@ fn convert_samples_and_removes_outliers() {
         assert_eq!(run.status, 2, "{wrong}");
     }
 }
+
+#[test]
+fn view_writes_a_page_of_the_clouds() {
+    let scratch = Scratch::new();
+    let (a, b) = (scratch.xyz("a<b>.xyz", &surface(10, 2.0)), scratch.xyz("b.xyz", &surface(12, 2.0)));
+    let pose = scratch.file("T.txt", "1 0 0 10\n0 1 0 0\n0 0 1 0\n0 0 0 1\n");
+    let page = scratch.path("page.html");
+    let run = upcr(["view", &a, &b, &b, "--pose", &pose, "--out", &page, "--no-open"]);
+    assert_eq!((run.status, run.stdout), (0, format!("{page}\n")), "{}", run.stderr);
+    let html = std::fs::read_to_string(&page).unwrap();
+    assert!(
+        html.starts_with("<!doctype html>")
+            && html.contains("a\\u003cb\\u003e.xyz")
+            && !html.contains("a<b>")
+    );
+
+    let empty = scratch.xyz("empty.xyz", &[[f64::NAN; 3]]);
+    upcr(["view", &a, &empty, "--no-open"]).assert_fails(1, &["empty.xyz", "no point"]);
+}

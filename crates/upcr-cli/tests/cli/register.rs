@@ -313,3 +313,22 @@ fn outputs_that_cannot_be_written_are_refused_before_the_work() {
         upcr(["register", &source, &target, option, &path]).assert_fails(1, &[word]);
     }
 }
+
+#[test]
+fn the_report_holds_the_answer_and_asks_for_nothing_else() {
+    let scratch = Scratch::new();
+    let report = scratch.path("out.html");
+    let (source, target) = (sample("source.ply"), sample("target.ply"));
+    let run = upcr(["register", &source, &target, "--json", "--report", &report]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let page = std::fs::read_to_string(&report).unwrap();
+    let data = page.split_once("id=\"page\">").unwrap().1.split_once("</script>").unwrap().0;
+    let told: Value = serde_json::from_str(data).unwrap();
+    assert_eq!(told["registration"], run.json());
+    assert_eq!(told["clouds"][0]["points"], 8308);
+    assert!(page.contains("default-src 'none'"));
+    assert_eq!(scratch.names(), ["out.html"]);
+
+    let nowhere = scratch.path("none/out.html");
+    upcr(["register", &source, &target, "--report", &nowhere]).assert_fails(1, &["there is no folder"]);
+}
