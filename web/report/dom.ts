@@ -41,8 +41,9 @@ export function choice<T extends string>(
   };
 }
 
-/** Numbers with as many digits as say something. */
-export function number(value: number): string {
+/** Numbers with as many digits as say something; JSON has null for what is none. */
+export function number(value: number | null): string {
+  if (value === null) return "–";
   if (value === 0) return "0";
   return Math.abs(value) < 1e-4 ? value.toExponential(3) : value.toLocaleString("en", { maximumSignificantDigits: 4 });
 }

@@ -121,7 +121,7 @@ if (page.distances) {
     ramp,
     el("div", { class: "ends" }, el("span", {}, "0"), reach),
     slider,
-    el("figcaption", {}, "from each point of the source to the nearest of the target, in the clouds’ unit"),
+    el("figcaption", {}, `from each point of the ${registered ? "source" : "first cloud"} to the nearest of the ${registered ? "target" : "second"}, in the clouds’ unit`),
   );
 }
 
@@ -299,7 +299,7 @@ document.body.prepend(
         registered ? side.element : null,
         registered ? layout.element : null,
         el("span", { class: "gap" }),
-        button("Whole", () => viewer?.reset(), { title: "Show the whole of it (Home)" }),
+        button("Reset", () => viewer?.reset(), { title: "The whole of it, from where it was seen first (Home)" }),
         button("Theme", turnTheme, { title: "Light or dark (t)" }),
         button("?", () => help.showModal(), { title: "Keys", "aria-label": "Keys" })),
       stage, legend),

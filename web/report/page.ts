@@ -25,7 +25,7 @@ export interface CloudInfo {
 
 export interface Registration {
   fitness: number;
-  inlier_rmse: number;
+  inlier_rmse: number | null;
   num_inliers: number;
   converged: boolean;
   iterations: number;

@@ -76,7 +76,7 @@ const FLIGHT = 700;
 /** Clouds whose middles are more than so many of their radii apart are drawn side by side where they are not registered. */
 const APART = 6;
 const FIELD = 40;
-const HOME = new Spherical(2.8, 1.15, 0.7);
+const HOME = new Spherical(3, 1.15, 0.7);
 
 /** A CSS colour as its own numbers, which the shader writes as they are. */
 function color(text: string): Color {

@@ -25,7 +25,7 @@ pub fn notations(pose: &Rigid) -> Vec<Notation> {
     vec![
         Notation {
             name: "4×4 matrix",
-            about: "Row after row: T_target_source of the JSON, and what `--init` and `--pose` read.",
+            about: "Row after row: T_target_source of the JSON, and what --init and --pose read.",
             text: rows.map(|row| line(&row)).join("\n"),
         },
         Notation {
@@ -54,7 +54,7 @@ pub fn notations(pose: &Rigid) -> Vec<Notation> {
         },
         Notation {
             name: "CloudCompare",
-            about: "For Edit, Apply transformation, or a file for `-APPLY_TRANS`; decimals without exponents.",
+            about: "For Edit, Apply transformation, or a file for -APPLY_TRANS; decimals without exponents.",
             text: rows.map(|row| row.map(|v| v.to_string()).join(" ")).join("\n"),
         },
     ]
