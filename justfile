@@ -24,6 +24,15 @@ guide:
     target/guide-venv/bin/pip install --quiet --requirement docs/guide/requirements.txt ./crates/upcr-python
     target/guide-venv/bin/python -m sphinx --fail-on-warning --quiet -c docs/guide docs target/guide
 
+# Build the viewer that reports hold
+viewer:
+    cd web && npm ci --ignore-scripts && npm run build
+
+# Check the viewer, and reports in a browser
+web:
+    cargo build --release -p upcr-cli
+    web/test
+
 # Format the code
 fmt:
     cargo fmt
