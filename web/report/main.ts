@@ -276,7 +276,7 @@ for (const cloud of page.clouds) {
     notes.append(el("li", {}, el("bdi", {}, cloud.name), `: thinned for display to ${count(cloud.shown)} of ${count(cloud.points)} points, by chance.`));
   }
   if (cloud.left_out > 0) {
-    notes.append(el("li", {}, el("bdi", {}, cloud.name), `: ${count(cloud.left_out)} points without finite coordinates are left out.`));
+    notes.append(el("li", {}, el("bdi", {}, cloud.name), `: ${count(cloud.left_out)} ${cloud.left_out === 1 ? "point without finite coordinates is" : "points without finite coordinates are"} left out.`));
   }
 }
 if (viewer && viewer.broughtFrom !== null) {

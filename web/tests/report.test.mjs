@@ -138,6 +138,28 @@ test("hostile names and comments are text", async () => {
   await close();
 });
 
+test("shows the files' own colours, several clouds, and says what it leaves out", async () => {
+  const path = join(scratch, "colors.html");
+  /** @param {string} name @param {string} rest @param {number} shift */
+  const cloud = (name, rest, shift) => {
+    const lines = Array.from({ length: 3000 }, (_, i) => `${Math.sin(i) + shift} ${Math.cos(1.3 * i)} ${i / 3000}${rest}`);
+    writeFileSync(join(scratch, name), [...lines, `nan 0 0${rest}`].join("\n"));
+    return join(scratch, name);
+  };
+  const clouds = [cloud("a.xyzrgb", " 20 40 250", 0), cloud("b.xyzrgb", " 20 40 250", 2), cloud("c.xyz", "", 4)];
+  upcr("view", ...clouds, "--no-open", "--out", path);
+  const { page, wrong, close } = await open(browser, path);
+  assert.ok(share(await pixels(page), "orange") > 0.005);
+  assert.equal(await page.getByText("1 point without finite coordinates").count(), 3);
+  await page.getByRole("button", { name: "The files’" }).click();
+  await settle(page);
+  const own = await pixels(page);
+  assert.ok(share(own, "orange") < 0.001 && share(own, "blue") > 0.01);
+  assert.equal(await page.getByRole("checkbox").count(), 3);
+  assert.deepEqual(wrong, []);
+  await close();
+});
+
 test("a script that is not the page's own does not run", async () => {
   const path = join(scratch, "tampered.html");
   upcr("view", source, "--no-open", "--out", path);
