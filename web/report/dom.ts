@@ -51,3 +51,19 @@ export function number(value: number | null): string {
 export function count(value: number): string {
   return value.toLocaleString("en");
 }
+
+export function section(title: string, ...children: readonly Child[]): HTMLElement {
+  return el("section", {}, el("h2", {}, title), ...children);
+}
+
+export function table(rows: readonly (readonly [string, string])[]): HTMLElement {
+  return el("table", {}, el("tbody", {}, ...rows.map(([name, value]) =>
+    el("tr", {}, el("th", { scope: "row" }, name), el("td", {}, value)))));
+}
+
+/** Has the document styled so: the page's policy allows no style that is written into it. */
+export function adopt(style: string): void {
+  const sheet = new CSSStyleSheet();
+  sheet.replaceSync(style);
+  document.adoptedStyleSheets.push(sheet);
+}

@@ -29,7 +29,7 @@ export async function launch() {
   });
 }
 
-/** Opens a page from its file and waits until it stands.
+/** Opens a page from its file, or from a server, and waits until it stands.
  *  @param {import("playwright-core").Browser} browser
  *  @param {string} path
  *  @param {import("playwright-core").BrowserContextOptions} options
@@ -40,7 +40,7 @@ export async function open(browser, path, options = {}, script = "") {
   const page = await context.newPage();
   /** @type {string[]} */
   const wrong = [];
-  const url = pathToFileURL(path).href;
+  const url = path.startsWith("http:") ? path : pathToFileURL(path).href;
   page.on("console", (message) => {
     // What the driver says of tests that read pixels back is no fault of the page.
     if (["error", "warning"].includes(message.type()) && !message.text().includes("GPU stall")) wrong.push(message.text());
@@ -51,7 +51,8 @@ export async function open(browser, path, options = {}, script = "") {
     void dialog.dismiss();
   });
   page.on("request", (request) => {
-    if (request.url() !== url) wrong.push(`request: ${request.url()}`);
+    // What a page makes itself comes from nowhere.
+    if (request.url() !== url && !request.url().startsWith("blob:")) wrong.push(`request: ${request.url()}`);
   });
   if (script) await page.addInitScript(script);
   await page.goto(url);

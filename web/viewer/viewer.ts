@@ -118,6 +118,8 @@ export class Viewer {
   #drawing = false;
   #waiting = false;
   #asked = false;
+  #gone = false;
+  readonly #resized = new ResizeObserver(() => this.draw());
   #reach = 0;
   #distances: Record<Side, BufferAttribute | null> = { before: null, after: null };
   #palette: Palette = { background: "#fff", clouds: ["#000"], quiet: "#888", map: [0, 1] };
@@ -165,6 +167,7 @@ export class Viewer {
     this.#scene.add(this.#world);
 
     this.canvas.addEventListener("webglcontextlost", (event) => {
+      if (this.#gone) return;
       event.preventDefault();
       this.onTrouble("The graphics driver gave up the picture. It comes back by itself where it can; else load the page again.");
     });
@@ -177,7 +180,22 @@ export class Viewer {
     host.prepend(this.canvas);
     this.#controls = this.#newControls();
     this.reset();
-    new ResizeObserver(() => this.draw()).observe(host);
+    this.#resized.observe(host);
+  }
+
+  /** Frees what the graphics card holds, and takes the picture away. */
+  dispose(): void {
+    this.#gone = true;
+    this.#resized.disconnect();
+    this.#controls.dispose();
+    for (const { geometry, material } of this.#drawn) {
+      geometry.dispose();
+      material.uniforms["map"]?.value?.dispose();
+      material.dispose();
+    }
+    this.canvas.remove();
+    this.#renderer.dispose();
+    this.#renderer.forceContextLoss();
   }
 
   /** The pose that "after" shows; flown to from what is shown now. */
@@ -278,11 +296,11 @@ export class Viewer {
 
   /** Draws with the next frame. */
   draw(): void {
-    if (this.#asked) return;
+    if (this.#asked || this.#gone) return;
     this.#asked = true;
     requestAnimationFrame((now) => {
       this.#asked = false;
-      this.#frame(now);
+      if (!this.#gone) this.#frame(now);
     });
   }
 
@@ -378,6 +396,7 @@ export class Viewer {
         requestAnimationFrame(look);
         return;
       }
+      if (this.#gone) return;
       gl.deleteSync(sync);
       this.#drawing = false;
       const took = performance.now() - start;

@@ -9,4 +9,4 @@ mod page;
 
 pub use display::MOST_POINTS;
 pub use notation::{Notation, notations};
-pub use page::Page;
+pub use page::{Contents, Page};

@@ -20,6 +20,15 @@ pub struct Page<'a> {
     most_points: usize,
 }
 
+/// What a page is about.
+#[derive(Debug, Clone)]
+pub struct Contents {
+    /// What is to be told, as JSON in which no character means something to HTML.
+    pub words: String,
+    /// What is to be drawn: points, colours and distances, each with its name.
+    pub blobs: Vec<(String, Vec<u8>)>,
+}
+
 #[derive(Serialize)]
 struct Told<'a> {
     version: &'static str,
@@ -105,6 +114,14 @@ impl<'a> Page<'a> {
     /// # Errors
     /// [`upcr::Error::TooFewPoints`] where a cloud has no point with finite coordinates.
     pub fn html(&self) -> Result<String> {
+        Ok(assemble(&self.contents()?))
+    }
+
+    /// What the page's script reads.
+    ///
+    /// # Errors
+    /// As [`Self::html`].
+    pub fn contents(&self) -> Result<Contents> {
         let shown: Vec<Displayed> = self
             .clouds
             .iter()
@@ -150,7 +167,7 @@ impl<'a> Page<'a> {
             verdict: self.found.map(told_verdict),
             registration: self.found,
         };
-        Ok(assemble(&told, &blobs))
+        Ok(Contents { words: json(&told), blobs })
     }
 }
 
@@ -168,7 +185,7 @@ fn told_verdict(found: &Registration) -> ToldVerdict<'_> {
     }
 }
 
-fn assemble(told: &Told, blobs: &[(String, Vec<u8>)]) -> String {
+fn assemble(Contents { words, blobs }: &Contents) -> String {
     let size: usize = blobs.iter().map(|(_, bytes)| 4 * bytes.len().div_ceil(3) + 64).sum();
     let mut html = String::with_capacity(SCRIPT.len() + size + (1 << 16));
     // No other script runs, and nothing is fetched: not from elsewhere, and not from where the page came from.
@@ -180,8 +197,7 @@ fn assemble(told: &Told, blobs: &[(String, Vec<u8>)]) -> String {
          <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'sha256-{SCRIPT_SHA256}'; \
          base-uri 'none'; form-action 'none'\">\n<title>UPCR</title>\n</head>\n<body>\n\
          <noscript>The clouds are drawn by the page's own script, and scripts are turned off here.</noscript>\n\
-         <script type=\"application/json\" id=\"page\">{}</script>\n",
-        json(told)
+         <script type=\"application/json\" id=\"page\">{words}</script>\n"
     );
     for (id, bytes) in blobs {
         let _ = write!(html, "<script type=\"text/plain\" id=\"{id}\">");

@@ -1,9 +1,9 @@
 //! From a cloud to its descriptors in one call.
 
 use std::num::NonZeroUsize;
-use std::time::Instant;
 
 use serde::Serialize;
+use web_time::Instant;
 
 use super::{Descriptors, Feature, FeatureInput};
 use crate::PointCloud;

@@ -169,6 +169,7 @@ pub(super) fn gather(
 
 /// Has `len` values brought into cache.
 #[inline(always)]
+#[cfg_attr(not(target_arch = "x86_64"), allow(unused_variables))]
 pub(super) fn prefetch(values: *const f32, len: usize) {
     #[cfg(target_arch = "x86_64")]
     for line in (0..len).step_by(16) {

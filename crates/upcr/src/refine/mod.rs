@@ -19,10 +19,10 @@ pub use lock::Locks;
 pub use robust::RobustKernel;
 pub(crate) use solver::{Correspondence, Objective, align};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// What the refinement minimises.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[cfg_attr(feature = "clap", derive(clap::ValueEnum), value(rename_all = "snake_case"))]
 pub enum Refinement {

@@ -4,7 +4,8 @@ mod answer;
 mod candidates;
 
 use std::sync::Arc;
-use std::time::Instant;
+
+use web_time::Instant;
 
 use crate::{
     CloudRole, PointCloud, Result,
