@@ -28,7 +28,12 @@ guide:
 viewer:
     cd web && npm ci --ignore-scripts && npm run build
 
-# Check the viewer, and reports in a browser
+# Build the page that registers in the browser into target/web/index.html
+page:
+    rustup target add wasm32-unknown-unknown
+    cd web && npm ci --ignore-scripts && npm run page
+
+# Check the viewer, and in a browser the reports and the page that registers
 web:
     cargo build --release -p upcr-cli
     web/test

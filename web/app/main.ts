@@ -160,5 +160,5 @@ async function load(): Promise<void> {
 
 load().catch((error: unknown) => {
   fail(error);
-  formats.textContent = "This page needs WebAssembly with SIMD: Chrome 91, Firefox 89, Safari 16.4 or newer.";
+  formats.textContent = "This page needs WebAssembly with SIMD: Chrome 91, Firefox 113, Safari 16.4 or newer.";
 });

@@ -10,6 +10,8 @@ import { chromium } from "playwright-core";
 
 const root = fileURLToPath(new URL("../..", import.meta.url));
 export const samples = join(root, "samples");
+/** The page that registers, as `npm run page` builds it. */
+export const built = join(process.env["CARGO_TARGET_DIR"] ?? join(root, "target"), "web/index.html");
 export const scratch = mkdtempSync(join(tmpdir(), "upcr-web-"));
 
 /** @returns {string} what `upcr` prints; exit status 3, no trustworthy pose, is an answer too
