@@ -21,6 +21,8 @@ export interface CloudInfo {
   origin: Triple;
   step: number;
   colors: boolean;
+  /** What the file says of itself. */
+  comments: readonly string[];
 }
 
 export interface Registration {

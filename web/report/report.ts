@@ -16,6 +16,9 @@ const KEYS: readonly (readonly [string, string])[] = [
   ["[ ]", "smaller, larger points"], ["t", "light, dark"], ["?", "this list"],
 ];
 
+/** So many comments of a file are shown at once. */
+const FEW = 3;
+
 /** What whoever shows a report adds to it. */
 export interface Additions {
   /** At the end of the toolbar. */
@@ -213,7 +216,9 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
       const role = page.verdict || registered ? ["source", "target"][i] ?? "" : "";
       const told = [role, `${count(cloud.points)} points`].filter((t) => t !== "").join(", ");
       return el("li", {}, el("label", {}, box, el("span", { class: `swatch cloud-${i % 6}`, "aria-hidden": "true" }),
-        el("span", { class: "name" }, el("bdi", {}, cloud.name)), el("span", { class: "quiet" }, told)));
+        el("span", { class: "name" }, el("bdi", {}, cloud.name)), el("span", { class: "quiet" }, told)),
+        cloud.comments.length === 0 ? null : el("details", { class: "quiet", open: cloud.comments.length <= FEW },
+          el("summary", {}, "What the file says of itself"), ...cloud.comments.map((text) => el("p", {}, el("bdi", {}, text)))));
     })), notes);
   }
 

@@ -196,13 +196,15 @@ test("tells what is wrong with a file, and goes on", async () => {
 });
 
 test("hostile names and comments are text", async () => {
+  const comment = "</script><script>alert(3)</script><b>&lt;";
   const bad = `"><img src=x onerror=alert(1)><script>alert(2)<!--&amp;\u2028'.ply`;
-  const cloud = ply(bad, 2000, (i) => [Math.sin(i), Math.cos(1.7 * i), i / 1000], "</script><script>alert(3)</script>");
+  const cloud = ply(bad, 2000, (i) => [Math.sin(i), Math.cos(1.7 * i), i / 1000], comment);
   const { page, wrong, close } = await open(browser, built);
   await register(page, cloud, target);
   assert.ok((await page.locator("h1").first().textContent())?.includes(bad));
   assert.ok((await page.locator(".slot").first().textContent())?.includes(bad));
-  assert.equal(await page.locator("img").count(), 0);
+  assert.equal(await page.locator(".clouds details p").first().textContent(), comment);
+  assert.equal(await page.locator("img, .clouds b").count(), 0);
   const report = await open(browser, await save(page, "Report"));
   assert.ok((await report.page.locator("h1").textContent())?.includes(bad));
   assert.deepEqual([...wrong, ...report.wrong], []);

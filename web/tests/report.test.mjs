@@ -127,12 +127,14 @@ test("shows the verdict, its reasons, and the alternatives that are clicked", as
 
 test("hostile names and comments are text", async () => {
   const path = join(scratch, "hostile.html");
+  const comment = "</script><script>alert(3)</script><b>&lt;";
   const bad = `"><img src=x onerror=alert(1)><script>alert(2)<!--&amp;\u2028'.ply`;
-  const cloud = ply(bad, 2000, (i) => [Math.sin(i), Math.cos(1.7 * i), i / 1000], "</script><script>alert(3)</script>");
+  const cloud = ply(bad, 2000, (i) => [Math.sin(i), Math.cos(1.7 * i), i / 1000], comment);
   upcr("view", cloud, target, "--no-open", "--out", path);
   const { page, wrong, close } = await open(browser, path);
   assert.ok((await page.locator("h1").textContent())?.includes(bad));
-  assert.equal(await page.locator("img").count(), 0);
+  assert.equal(await page.locator(".clouds details p").first().textContent(), comment);
+  assert.equal(await page.locator("img, .clouds b").count(), 0);
   assert.ok((await page.title()).includes("<script>"));
   assert.deepEqual(wrong, []);
   await close();

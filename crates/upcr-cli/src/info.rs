@@ -4,7 +4,9 @@ use std::fmt::Write;
 use std::path::PathBuf;
 
 use anyhow::Result;
+use serde::Serialize;
 use upcr::cloud::Summary;
+use upcr::io;
 
 use crate::Status;
 use crate::{input, output};
@@ -21,17 +23,25 @@ pub struct Args {
     reading: input::Reading,
 }
 
+#[derive(Serialize)]
+struct Told {
+    #[serde(flatten)]
+    summary: Summary,
+    comments: Vec<String>,
+}
+
 pub fn run(args: &Args) -> Result<Status> {
     let summary = args.reading.read(&args.file)?.summary();
+    let told = Told { summary, comments: io::read_comments(&args.file)? };
     if args.json {
-        output::answer_json(&summary)?;
+        output::answer_json(&told)?;
     } else {
-        output::answer(&lines(&summary))?;
+        output::answer(&lines(&told))?;
     }
     Ok(Status::Done)
 }
 
-fn lines(summary: &Summary) -> String {
+fn lines(Told { summary, comments }: &Told) -> String {
     let triple = |v: [f64; 3]| format!("({:.6}, {:.6}, {:.6})", v[0], v[1], v[2]);
     let yes = |has: bool| if has { "yes" } else { "no" };
     let mut text = format!("points      {}\n", summary.points);
@@ -50,5 +60,9 @@ fn lines(summary: &Summary) -> String {
         }
     }
     let _ = writeln!(text, "normals     {}\ncolours     {}", yes(summary.normals), yes(summary.colors));
+    for comment in comments {
+        // What controls a terminal does not get to one.
+        let _ = writeln!(text, "comment     {}", comment.replace(char::is_control, "\u{fffd}"));
+    }
     text
 }

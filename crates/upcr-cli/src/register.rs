@@ -200,7 +200,8 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status
     }
     if let Some(path) = &args.report {
         let [a, b] = [source_path, target_path].map(|path| path.display().to_string());
-        let page = Page::of_registration((&a, &source), (&b, &target), &found);
+        let comments = [io::read_comments(source_path)?, io::read_comments(target_path)?];
+        let page = Page::of_registration((&a, &source), (&b, &target), &found).with_comments(&comments);
         write_atomically(path, page.html()?.as_bytes())?;
     }
     drop(progress);

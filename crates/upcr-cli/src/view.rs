@@ -38,6 +38,7 @@ pub fn run(args: &Args) -> Result<Status> {
     let pose = args.pose.as_deref().map(io::read_transform).transpose()?;
     let mut progress = Progress::new();
     let mut clouds: Vec<(String, PointCloud)> = Vec::new();
+    let mut comments = Vec::new();
     for path in &args.clouds {
         progress.step("reading");
         let cloud = args.reading.read(path)?;
@@ -45,10 +46,11 @@ pub fn run(args: &Args) -> Result<Status> {
             bail!("{}: there is no point with finite coordinates in it", path.display());
         }
         clouds.push((path.display().to_string(), cloud));
+        comments.push(io::read_comments(path)?);
     }
     progress.step("writing");
     let named: Vec<_> = clouds.iter().map(|(name, cloud)| (name.as_str(), cloud)).collect();
-    let mut page = Page::of_clouds(&named);
+    let mut page = Page::of_clouds(&named).with_comments(&comments);
     if let Some(pose) = &pose {
         page = page.with_pose(pose);
     }

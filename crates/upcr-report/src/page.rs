@@ -11,12 +11,17 @@ use crate::notation::{Notation, notations};
 const SCRIPT: &str = include_str!("../assets/viewer.js");
 const SCRIPT_SHA256: &str = include_str!("../assets/viewer.sha256");
 
+/// Comments of one file that a page tells, and characters of each.
+const MOST_COMMENTS: usize = 20;
+const LONGEST_COMMENT: usize = 300;
+
 /// Clouds, and what is known of the pose that lays the first on the second.
 #[derive(Debug, Clone)]
 pub struct Page<'a> {
     clouds: Vec<(&'a str, &'a PointCloud)>,
     poses: Vec<(Rigid, Option<f64>)>,
     found: Option<&'a Registration>,
+    comments: Vec<Vec<String>>,
     most_points: usize,
 }
 
@@ -48,6 +53,7 @@ struct ToldCloud<'a> {
     origin: [f64; 3],
     step: f64,
     colors: bool,
+    comments: &'a [String],
 }
 
 #[derive(Serialize)]
@@ -81,7 +87,13 @@ struct ToldReason<'a> {
 impl<'a> Page<'a> {
     /// Of clouds as they lie, each with its name.
     pub fn of_clouds(clouds: &[(&'a str, &'a PointCloud)]) -> Self {
-        Self { clouds: clouds.to_vec(), poses: Vec::new(), found: None, most_points: MOST_POINTS }
+        Self {
+            clouds: clouds.to_vec(),
+            poses: Vec::new(),
+            found: None,
+            comments: Vec::new(),
+            most_points: MOST_POINTS,
+        }
     }
 
     /// Of a registration: its pose and the alternatives, the verdict, the settings, the times.
@@ -99,6 +111,18 @@ impl<'a> Page<'a> {
     #[must_use]
     pub fn with_pose(mut self, pose: &Rigid) -> Self {
         self.poses = vec![(*pose, None)];
+        self
+    }
+
+    /// With what each cloud's file says of itself, in the clouds' order; of much, the beginning.
+    #[must_use]
+    pub fn with_comments(mut self, comments: &[Vec<String>]) -> Self {
+        let brief = |text: &String| match text.char_indices().nth(LONGEST_COMMENT) {
+            Some((end, _)) => format!("{}…", &text[..end]),
+            None => text.clone(),
+        };
+        self.comments =
+            comments.iter().map(|all| all.iter().take(MOST_COMMENTS).map(brief).collect()).collect();
         self
     }
 
@@ -140,6 +164,7 @@ impl<'a> Page<'a> {
                 origin: shown.origin,
                 step: shown.step,
                 colors: colors.is_some(),
+                comments: self.comments.get(i).map_or(&[], Vec::as_slice),
             });
             blobs.extend(colors.map(|colors| (format!("colors-{i}"), colors)));
         }
@@ -294,6 +319,20 @@ mod tests {
         assert!(html.contains("default-src 'none'; script-src 'sha256-"));
         assert!(!SCRIPT.contains("</script") && !SCRIPT.contains("<!--") && !SCRIPT.contains('\r'));
         assert_eq!(SCRIPT_SHA256.len(), 44);
+    }
+
+    #[test]
+    fn comments_are_told_in_brief() {
+        let cloud = cloud(0);
+        let comments = [vec![HOSTILE.to_owned(), "ä".repeat(1000)], vec![String::new(); 1000]];
+        let page = Page::of_clouds(&[("a", &cloud), ("b", &cloud), ("c", &cloud)]).with_comments(&comments);
+        let html = page.html().unwrap();
+        let (told, _) = read(&html);
+        assert_eq!(told["clouds"][0]["comments"][0], HOSTILE);
+        assert_eq!(told["clouds"][0]["comments"][1], format!("{}…", "ä".repeat(LONGEST_COMMENT)));
+        assert_eq!(told["clouds"][1]["comments"].as_array().unwrap().len(), MOST_COMMENTS);
+        assert_eq!(told["clouds"][2]["comments"].as_array().unwrap().len(), 0);
+        assert!(!html.contains("alert(1)</script>") && !html.contains("<img"));
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use std::io::Cursor;
 
 use serde::Deserialize;
-use upcr::io::{ReadOptions, WriteOptions, read_cloud_from, write_cloud_to};
+use upcr::io::{ReadOptions, WriteOptions, read_cloud_from, read_comments_from, write_cloud_to};
 use upcr::{
     Method, PointCloud, Progress, Refinement, Registration, Result, Rigid, Settings, Watch, register_watched,
 };
@@ -43,6 +43,10 @@ impl File<'_> {
     fn read(self) -> Result<PointCloud> {
         read_cloud_from(self.name, Cursor::new(self.bytes), &ReadOptions::default())
     }
+
+    fn comments(self) -> Result<Vec<String>> {
+        read_comments_from(self.name, Cursor::new(self.bytes))
+    }
 }
 
 /// Two scans, and how one lies on the other.
@@ -50,6 +54,7 @@ impl File<'_> {
 pub struct Outcome {
     names: [String; 2],
     clouds: [PointCloud; 2],
+    comments: [Vec<String>; 2],
     found: Registration,
 }
 
@@ -65,14 +70,15 @@ impl Outcome {
         progress: &(dyn Fn(Progress) + Sync),
     ) -> Result<Self> {
         let clouds = [source.read()?, target.read()?];
-        let watch = Watch { cancelled: None, progress: Some(progress) };
+        let comments = [source.comments()?, target.comments()?];
+        let watch = Watch { progress: Some(progress), ..Watch::default() };
         let found = register_watched(&clouds[0], &clouds[1], &choices.settings(), &watch)?;
-        Ok(Self { names: [source.name, target.name].map(Into::into), clouds, found })
+        Ok(Self { names: [source.name, target.name].map(Into::into), clouds, comments, found })
     }
 
     fn page(&self) -> Page<'_> {
         let [source, target] = [0, 1].map(|i| (self.names[i].as_str(), &self.clouds[i]));
-        Page::of_registration(source, target, &self.found)
+        Page::of_registration(source, target, &self.found).with_comments(&self.comments)
     }
 
     /// What the page shows.

@@ -19,6 +19,17 @@ fn info_says_what_a_file_holds() {
 }
 
 #[test]
+fn info_tells_comments_and_leaves_the_terminal_alone() {
+    let scratch = Scratch::new();
+    let ply = "ply\nformat ascii 1.0\ncomment \u{1b}[31mred\nelement vertex 1\nproperty float x\nproperty float y\n\
+               property float z\nend_header\n1 2 3\n";
+    let file = scratch.file("a.ply", ply);
+    assert_eq!(upcr(["info", &file, "--json"]).json()["comments"][0], "\u{1b}[31mred");
+    let lines = upcr(["info", &file]).stdout;
+    assert!(lines.contains("comment     \u{fffd}[31mred\n"), "{lines}");
+}
+
+#[test]
 fn convert_keeps_the_points() {
     let scratch = Scratch::new();
     let points = surface(10, 2.0);

@@ -174,6 +174,30 @@ pub fn read_cloud_from(
     take(name, format.name, stream, |input| cloud_of(format, input, options))
 }
 
+/// What a file says to people: the comments in the header of a PLY. Those of other formats are notes to programs, and there
+/// are none here.
+///
+/// # Errors
+/// As [`read_cloud`].
+pub fn read_comments(path: impl AsRef<Path>) -> Result<Vec<String>> {
+    let path = path.as_ref();
+    read_comments_from(path, open_known(path)?)
+}
+
+/// Reads comments as [`read_comments`] does, from memory or any stream, named as for [`read_cloud_from`].
+///
+/// # Errors
+/// As [`read_cloud`].
+pub fn read_comments_from(name: impl AsRef<Path>, stream: impl Read + Seek) -> Result<Vec<String>> {
+    let name = name.as_ref();
+    let format = format_of(name)?;
+    if format.name == ply::FORMAT.name {
+        take(name, format.name, stream, ply::read_comments)
+    } else {
+        Ok(Vec::new())
+    }
+}
+
 /// Reads a mesh: OFF, OBJ, STL, or the vertices and faces of a PLY. Polygons are cut into fans of triangles.
 ///
 /// # Errors

@@ -114,6 +114,17 @@ fn read_mesh(input: &mut Input) -> Fallible<TriangleMesh> {
     Ok(mesh)
 }
 
+/// What the header says to people.
+pub(super) fn read_comments(input: &mut Input) -> Fallible<Vec<String>> {
+    let mut line = String::new();
+    let mut comments = Vec::new();
+    while input.line(&mut line)? && line.trim_end() != "end_header" {
+        let said = ["comment", "obj_info"].iter().find_map(|word| line.strip_prefix(word));
+        comments.extend(said.filter(|text| text.starts_with([' ', '\t'])).map(|text| text.trim().to_owned()));
+    }
+    Ok(comments)
+}
+
 fn read_header(input: &mut Input) -> Fallible<(Vec<Element>, Body)> {
     let mut line = String::new();
     if !input.line(&mut line)? || line.trim_end() != "ply" {

@@ -678,3 +678,13 @@ fn memory_that_is_no_file_is_called_by_its_name() {
     let pose = read_transform_from("pose", Cursor::new("1 0 0")).unwrap_err();
     assert!(matches!(&pose, Error::Malformed { path, .. } if path == Path::new("pose")), "{pose}");
 }
+
+#[test]
+fn comments_are_what_the_header_says_to_people() {
+    let ply = "ply\nformat ascii 1.0\ncomment made by <b>hand</b>\r\nobj_info \tscanner 3\ncommentary\ncomment\n\
+               element vertex 1\nproperty float x\nend_header\ncomment no more\n";
+    let read = |name, text: &str| read_comments_from(name, Cursor::new(text.as_bytes().to_vec())).unwrap();
+    assert_eq!(read("a.ply", ply), ["made by <b>hand</b>", "scanner 3"]);
+    assert!(read("a.xyz", "# x y z\n1 2 3\n").is_empty());
+    assert!(read_comments_from("a.docx", Cursor::new(ply.as_bytes())).is_err());
+}
