@@ -101,6 +101,7 @@ async function run(): Promise<void> {
   try {
     const { words, blobs, ms } = await engine.register(...both, choices());
     show(words, blobs);
+    // For whoever measures from outside.
     root.dataset["ms"] = String(ms);
   } catch (error) {
     if (!(error instanceof Cancelled)) fail(error);

@@ -7,6 +7,13 @@ const tell = (told: Told, transfer: Transferable[] = []) => self.postMessage(tol
 
 let registered: Registered | null = null;
 
+const read = async (file: File) => new Uint8Array(await file.arrayBuffer());
+
+function held(): Registered {
+  if (!registered) throw new Error("nothing has been registered");
+  return registered;
+}
+
 async function answer(asked: Asked): Promise<void> {
   switch (asked.kind) {
     case "load":
@@ -18,8 +25,7 @@ async function answer(asked: Asked): Promise<void> {
       registered = null;
       tell({ kind: "progress", stage: "reading", done: 0 });
       const { source, target } = asked;
-      const [a, b] = await Promise.all([source, target].map(async (file) => new Uint8Array(await file.arrayBuffer())));
-      if (!a || !b) break;
+      const [a, b] = await Promise.all([read(source), read(target)]);
       const start = performance.now();
       registered = register(source.name, a, target.name, b, JSON.stringify(asked.choices),
         (stage: string, done: number) => tell({ kind: "progress", stage, done }));
@@ -32,12 +38,12 @@ async function answer(asked: Asked): Promise<void> {
       break;
     }
     case "aligned": {
-      const content = registered?.aligned(asked.pose, asked.name) as Uint8Array<ArrayBuffer> | undefined;
-      if (content) tell({ kind: "made", content }, [content.buffer]);
+      const content = held().aligned(asked.pose, asked.name) as Uint8Array<ArrayBuffer>;
+      tell({ kind: "made", content }, [content.buffer]);
       break;
     }
     case "report":
-      if (registered) tell({ kind: "made", content: registered.report() });
+      tell({ kind: "made", content: held().report() });
       break;
   }
 }
