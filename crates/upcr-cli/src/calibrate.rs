@@ -220,7 +220,7 @@ fn run_test(args: &Test) -> Result<Status> {
         "version": env!("CARGO_PKG_VERSION"),
     });
     let file = |name: &str| args.out.join(name);
-    write_atomically(&file("reliability.svg"), drawing::svg(&picture)?.as_bytes())?;
+    write_atomically(&file("reliability.svg"), drawing::svg(&picture).as_bytes())?;
     write_atomically(&file("reliability.png"), &drawing::png(&picture)?)?;
     write_atomically(&file("results.json"), serde_json::to_string_pretty(&results)?.as_bytes())?;
     write_atomically(&file("report.md"), text.as_bytes())?;

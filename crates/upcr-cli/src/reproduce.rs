@@ -135,7 +135,7 @@ fn write_outcome(folder: &Path, outcome: &Outcome) -> Result<()> {
     let file = |extension: &str| folder.join(format!("{}.{extension}", outcome.name));
     write_atomically(&file("csv"), csv(outcome).as_bytes())?;
     if let Some(picture) = picture(outcome) {
-        write_atomically(&file("svg"), drawing::svg(&picture)?.as_bytes())?;
+        write_atomically(&file("svg"), drawing::svg(&picture).as_bytes())?;
         write_atomically(&file("png"), &drawing::png(&picture)?)?;
     }
     Ok(())

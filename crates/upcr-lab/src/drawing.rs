@@ -1,110 +1,122 @@
-//! Pictures that are readable in print and by the colour-blind, as SVG and as PNG.
+//! Pictures in the style of the reports, as SVG and as PNG.
 
-use std::error::Error as StdError;
-use std::sync::Once;
+mod chart;
+mod png;
+mod style;
+mod svg;
 
-use plotters::coord::Shift;
-use plotters::prelude::*;
-use plotters::style::{FontStyle, RGBColor, register_font};
-use upcr::{Error, Result};
+pub use chart::{Axis, Chart, key, mark, set_apart, short, title};
+pub use png::png;
+pub use style::{Color, Letters, NAME, QUIET, STROKE, TITLE};
+pub use svg::svg;
 
-/// Colours that the colour-blind can tell apart (Okabe and Ito), dark enough for white paper.
-pub const COLORS: [RGBColor; 7] = [
-    RGBColor(0, 114, 178),
-    RGBColor(213, 94, 0),
-    RGBColor(0, 158, 115),
-    RGBColor(204, 121, 167),
-    RGBColor(230, 159, 0),
-    RGBColor(86, 180, 233),
-    RGBColor(0, 0, 0),
-];
-/// Letters of axes and legends, in units; captions are larger.
-pub const LETTERS: u32 = 13;
-/// Letters of captions.
-pub const CAPTION: u32 = 18;
-/// PNG pixels a unit of the picture.
-const PIXELS: u32 = 2;
+use style::{ROUND, RULE};
 
-/// What drawing ends with.
-pub type Drawn = std::result::Result<(), Box<dyn StdError>>;
+/// A place, in units from the upper left corner.
+pub type Point = (f64, f64);
 
-/// Something that can be drawn on any backend.
+/// Something that can be drawn.
 pub trait Picture {
-    /// Width and height.
+    /// Width and height, in units.
     fn size(&self) -> (u32, u32);
 
-    /// Draws everything, with lengths times `unit`.
-    ///
-    /// # Errors
-    /// Where the backend fails.
-    fn draw<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
-    where
-        B::ErrorType: 'static;
+    /// Puts everything onto the sheet.
+    fn draw(&self, sheet: &mut Sheet);
 }
 
-/// The picture as SVG.
-///
-/// # Errors
-/// Where it cannot be drawn.
-pub fn svg(picture: &impl Picture) -> Result<String> {
-    prepare_fonts();
-    let mut text = String::new();
-    let area = SVGBackend::with_string(&mut text, picture.size()).into_drawing_area();
-    drawn(picture, &area, 1)?;
-    drop(area);
-    Ok(text)
+/// Which of a text's points is given.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Anchor {
+    /// The left end.
+    Start,
+    /// The middle.
+    Middle,
+    /// The right end.
+    End,
 }
 
-/// The picture as PNG, in twice its size.
-///
-/// # Errors
-/// Where it cannot be drawn.
-pub fn png(picture: &impl Picture) -> Result<Vec<u8>> {
-    prepare_fonts();
-    let (width, height) = picture.size();
-    let (width, height) = (width * PIXELS, height * PIXELS);
-    let mut pixels = vec![255; (width * height * 3) as usize];
-    let area = BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area();
-    drawn(picture, &area, PIXELS)?;
-    drop(area);
-    let mut bytes = Vec::new();
-    let mut encoder = png::Encoder::new(&mut bytes, width, height);
-    encoder.set_color(png::ColorType::Rgb);
-    let write = || {
-        let mut writer = encoder.write_header()?;
-        writer.write_image_data(&pixels)?;
-        writer.finish()
-    };
-    write().map_err(|e| failed(&e))?;
-    Ok(bytes)
+/// Shapes, one upon the other.
+#[derive(Debug, Default)]
+pub struct Sheet(Vec<Shape>);
+
+#[derive(Debug)]
+enum Shape {
+    Line {
+        points: Vec<Point>,
+        width: f64,
+        dashed: bool,
+        color: Color,
+    },
+    Area {
+        points: Vec<Point>,
+        color: Color,
+    },
+    Rectangle {
+        corner: Point,
+        size: Point,
+        round: f64,
+        color: Color,
+    },
+    Circle {
+        center: Point,
+        radius: f64,
+        color: Color,
+    },
+    /// Its place is on the baseline.
+    Text {
+        at: Point,
+        text: String,
+        letters: Letters,
+        anchor: Anchor,
+    },
 }
 
-/// A font of so many units.
-pub fn font(size: u32, unit: u32) -> (&'static str, u32) {
-    ("sans-serif", size * unit)
-}
+/// Lengths of dashes and of the gaps between, in units.
+const DASH: (f64, f64) = (5.0, 4.0);
 
-fn drawn<B: DrawingBackend>(picture: &impl Picture, area: &DrawingArea<B, Shift>, unit: u32) -> Result<()>
-where
-    B::ErrorType: 'static,
-{
-    let draw = || -> Drawn {
-        area.fill(&WHITE)?;
-        picture.draw(area, unit)?;
-        Ok(area.present()?)
-    };
-    draw().map_err(|e| failed(e.as_ref()))
-}
+impl Sheet {
+    /// What a picture consists of, upon its page.
+    fn of(picture: &impl Picture) -> Self {
+        let (width, height) = picture.size();
+        let mut sheet = Self::default();
+        sheet.rectangle((0.0, 0.0), (f64::from(width), f64::from(height)), ROUND, Color::Page);
+        picture.draw(&mut sheet);
+        sheet
+    }
 
-fn failed(error: &dyn StdError) -> Error {
-    Error::InvalidSetting { name: "plot", reason: error.to_string() }
-}
+    /// A line through points.
+    pub fn line(&mut self, points: Vec<Point>, width: f64, color: Color) {
+        self.0.push(Shape::Line { points, width, dashed: false, color });
+    }
 
-/// Letters come with the program: bitmaps are the same on every machine.
-fn prepare_fonts() {
-    static ONCE: Once = Once::new();
-    ONCE.call_once(|| {
-        // A font that cannot be read makes drawing fail, which is told there.
-        let _ = register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT);
-    });
+    /// A dashed line through points.
+    pub fn dashes(&mut self, points: Vec<Point>, width: f64, color: Color) {
+        self.0.push(Shape::Line { points, width, dashed: true, color });
+    }
+
+    /// A thin straight line.
+    pub fn rule(&mut self, from: Point, to: Point) {
+        self.line(vec![from, to], RULE, Color::Line);
+    }
+
+    /// A filled polygon.
+    pub fn area(&mut self, points: Vec<Point>, color: Color) {
+        self.0.push(Shape::Area { points, color });
+    }
+
+    /// A filled rectangle of which the upper left corner is given.
+    pub fn rectangle(&mut self, corner: Point, size: Point, round: f64, color: Color) {
+        self.0.push(Shape::Rectangle { corner, size, round, color });
+    }
+
+    /// A filled circle.
+    pub fn circle(&mut self, center: Point, radius: f64, color: Color) {
+        self.0.push(Shape::Circle { center, radius, color });
+    }
+
+    /// A line of text about the height of a point.
+    pub fn text(&mut self, (x, y): Point, text: impl Into<String>, letters: Letters, anchor: Anchor) {
+        let at = (x, y + letters.drop());
+        self.0.push(Shape::Text { at, text: text.into(), letters, anchor });
+    }
 }

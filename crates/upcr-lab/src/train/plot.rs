@@ -3,29 +3,30 @@
 use std::fmt::Write;
 use std::path::Path;
 
-use plotters::coord::Shift;
-use plotters::prelude::*;
 use upcr::Result;
 
 use super::history::Event;
-use crate::drawing::{self, CAPTION, COLORS, Drawn, LETTERS, Picture, font};
+use crate::drawing::{
+    self, Anchor, Axis, Chart, Color, NAME, Picture, Point, QUIET, STROKE, Sheet, set_apart, title,
+};
 use crate::files::write_atomically;
 
-const SIZE: (u32, u32) = (960, 420);
+/// Lengths in units: of the picture, of a panel and its surroundings.
+const SIZE: (u32, u32) = (960, 380);
+const PANEL: Point = (318.0, 260.0);
+const TOP: f64 = 64.0;
+const LEFT: f64 = 60.0;
 
-/// A name, a colour, and points (step, value).
-type Line = (&'static str, RGBColor, Vec<(f64, f64)>);
+/// A name, its colour, whether it is dashed, and points (step, value).
+type Line = (&'static str, Color, bool, Vec<(f64, f64)>);
 
 /// Loss and held-out rotation error over the steps.
 struct LearningCurve<'a>(&'a [Event]);
 
 /// Loss and held-out rotation error over the steps, as SVG; empty for a curve without a point.
-///
-/// # Errors
-/// Where the picture cannot be drawn.
-pub fn learning_curve(history: &[Event]) -> Result<String> {
+pub fn learning_curve(history: &[Event]) -> String {
     if history.is_empty() {
-        return Ok(String::new());
+        return String::new();
     }
     drawing::svg(&LearningCurve(history))
 }
@@ -35,75 +36,67 @@ impl Picture for LearningCurve<'_> {
         SIZE
     }
 
-    fn draw<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
-    where
-        B::ErrorType: 'static,
-    {
-        let [learned, held_out, ..] = COLORS;
-        let (left, right) = area.split_horizontally(SIZE.0 * unit / 2);
+    fn draw(&self, sheet: &mut Sheet) {
+        let (learned, held_out) = (Color::Cloud(0), Color::Cloud(1));
         let at = |value: fn(&Event) -> Option<f64>| -> Vec<(f64, f64)> {
             let points = self.0.iter().filter_map(|e| Some((e.step as f64, value(e)?)));
             points.filter(|(_, y)| y.is_finite() && *y > 0.0).collect()
         };
+        let loss = [
+            ("learned from", learned, true, at(|e| Some(e.loss))),
+            ("held out", held_out, false, at(|e| e.validation.map(|v| v.loss))),
+        ];
+        panel(sheet, 0.0, ("Loss", "of pairs learned from and held out"), &loss);
+        let error = [("held out", held_out, false, at(|e| e.validation.map(|v| v.mae_r_deg)))];
         panel(
-            &left,
-            unit,
-            "Chamfer loss",
-            &[
-                ("learned from", learned, at(|e| Some(e.loss))),
-                ("held out", held_out, at(|e| e.validation.map(|v| v.loss))),
-            ],
-        )?;
-        panel(
-            &right,
-            unit,
-            "held out: MAE(R), degrees",
-            &[("held out", held_out, at(|e| e.validation.map(|v| v.mae_r_deg)))],
-        )
+            sheet,
+            f64::from(SIZE.0) / 2.0,
+            ("Rotation error", "MAE(R) of pairs held out, degrees"),
+            &error,
+        );
     }
 }
 
 /// Lines over the steps, the values' axis logarithmic.
-fn panel<B: DrawingBackend>(area: &DrawingArea<B, Shift>, unit: u32, title: &str, lines: &[Line]) -> Drawn
-where
-    B::ErrorType: 'static,
-{
-    let all = || lines.iter().flat_map(|(_, _, points)| points);
+fn panel(sheet: &mut Sheet, left: f64, (name, remark): (&str, &str), lines: &[Line]) {
+    let all = || lines.iter().flat_map(|(.., points)| points);
     let last = all().map(|p| p.0).fold(1.0, f64::max);
     let low = all().map(|p| p.1).fold(f64::INFINITY, f64::min);
     let high = all().map(|p| p.1).fold(0.0, f64::max);
     if !(low.is_finite() && high > 0.0) {
-        return Ok(());
+        return;
     }
-    let mut chart = ChartBuilder::on(area)
-        .caption(title, font(CAPTION, unit))
-        .margin(12 * unit)
-        .x_label_area_size(36 * unit)
-        .y_label_area_size(64 * unit)
-        .build_cartesian_2d(0.0..last, (low * 0.8..high * 1.25).log_scale())?;
-    chart
-        .configure_mesh()
-        .light_line_style(WHITE)
-        .label_style(font(LETTERS, unit))
-        .x_desc("steps")
-        .x_labels(6)
-        .draw()?;
-    for (name, color, points) in lines {
-        let color = *color;
-        chart
-            .draw_series(LineSeries::new(points.iter().copied(), color.stroke_width(2 * unit)))?
-            .label(*name)
-            .legend(move |(x, y)| {
-                PathElement::new([(x, y), (x + 18 * unit as i32, y)], color.stroke_width(2 * unit))
-            });
+    title(sheet, (left + 16.0, 12.0), name, remark);
+    let (x, y) = (Axis::linear(0.0, last), Axis::logarithmic(low * 0.9, high * 1.1));
+    let chart = Chart { corner: (left + LEFT, TOP), size: PANEL, x, y };
+    chart.panel(sheet);
+    chart.levels(sheet, &y.ticks());
+    chart.below(sheet, &x.ticks(), "steps");
+    let lines: Vec<_> = lines.iter().filter(|(.., points)| !points.is_empty()).collect();
+    let ends: Vec<Point> =
+        lines.iter().filter_map(|(.., points)| points.last()).map(|&(x, y)| chart.at(x, y)).collect();
+    for (_, color, dashed, points) in &lines {
+        let points = points.iter().map(|&(x, y)| chart.at(x, y)).collect();
+        if *dashed {
+            sheet.dashes(points, STROKE, *color);
+        } else {
+            sheet.line(points, STROKE, *color);
+        }
     }
-    chart
-        .configure_series_labels()
-        .label_font(font(LETTERS, unit))
-        .background_style(WHITE.mix(0.85))
-        .border_style(BLACK.mix(0.3))
-        .draw()?;
-    Ok(())
+    // Lines are named where they end, and one alone by the title.
+    let heights = set_apart(&ends.iter().map(|end| end.1).collect::<Vec<_>>(), TOP + PANEL.1);
+    let beside = left + LEFT + PANEL.0 + 8.0;
+    for ((&end, y), (name, color, ..)) in ends.iter().zip(heights).zip(&lines) {
+        sheet.circle(end, 3.5, *color);
+        if lines.len() > 1 {
+            sheet.text(
+                (beside, y),
+                *name,
+                if *color == Color::Cloud(0) { QUIET } else { NAME },
+                Anchor::Start,
+            );
+        }
+    }
 }
 
 /// Writes the curve into a run's folder: `history.csv`, and `history.svg` as a picture.
@@ -125,7 +118,7 @@ pub fn write_history(folder: &Path, history: &[Event]) -> Result<()> {
         );
     }
     write_atomically(&folder.join("history.csv"), csv.as_bytes())?;
-    write_atomically(&folder.join("history.svg"), learning_curve(history)?.as_bytes())
+    write_atomically(&folder.join("history.svg"), learning_curve(history).as_bytes())
 }
 
 #[cfg(test)]
@@ -135,7 +128,7 @@ mod tests {
 
     #[test]
     fn a_curve_has_its_lines_and_none_has_no_picture() {
-        assert_eq!(learning_curve(&[]).unwrap(), "");
+        assert_eq!(learning_curve(&[]), "");
         let event = |step: u64| Event {
             step,
             steps: 30,
@@ -151,7 +144,7 @@ mod tests {
             clouds_per_second: 10.0,
             seconds: 1.0,
         };
-        let picture = learning_curve(&[event(10), event(20), event(30)]).unwrap();
+        let picture = learning_curve(&[event(10), event(20), event(30)]);
         assert!(picture.starts_with("<svg"));
         assert!(picture.matches("<polyline").count() >= 3, "{picture}");
         assert!(picture.contains("MAE(R)"));

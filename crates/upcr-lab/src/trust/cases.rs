@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 use rand::Rng;
 use rand::seq::{IndexedRandom, SliceRandom};
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use upcr::neighbors::KdTree;
 use upcr::{Error, PointCloud, Result, Rigid, io};
 
@@ -17,7 +17,7 @@ use crate::eval::metrics::{Tolerance, diameter};
 use crate::random;
 
 /// What two clouds have in common.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
     /// The same points of one thing, moved.

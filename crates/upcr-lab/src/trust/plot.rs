@@ -1,105 +1,78 @@
 //! Reliability as a picture: what was said against what was true, and how often it was said.
 
-use plotters::coord::Shift;
-use plotters::prelude::*;
-
 use super::reliability::{BINS, Reliability};
-use crate::drawing::{CAPTION, COLORS, Drawn, LETTERS, Picture, font};
+use crate::drawing::{Axis, Chart, Color, Picture, Point, STROKE, Sheet, mark, title};
 
-/// Width of a panel, heights of its two parts, in units.
-const WIDTH: u32 = 330;
-const CURVE: u32 = 330;
-const COUNTS: u32 = 130;
+/// Sets that stand beside each other: as many as fit, and of more two.
+const BESIDE: usize = 3;
+/// Lengths in units: of a set's part of the picture, of its panels and their places.
+const SET: (u32, u32) = (330, 450);
+const CURVE: Point = (262.0, 262.0);
+const COUNTS: Point = (262.0, 60.0);
+const LEFT: f64 = 52.0;
+const TOP: f64 = 64.0;
+const BETWEEN: f64 = 12.0;
 
-/// A panel for each set of pairs, side by side.
+/// A panel for each set of pairs.
 pub fn picture<'a>(sets: &'a [(&'a str, &'a Reliability)]) -> impl Picture + 'a {
     Panels(sets)
 }
 
 struct Panels<'a>(&'a [(&'a str, &'a Reliability)]);
 
+impl Panels<'_> {
+    fn columns(&self) -> usize {
+        match self.0.len() {
+            count @ 0..=BESIDE => count.max(1),
+            _ => 2,
+        }
+    }
+}
+
 impl Picture for Panels<'_> {
     fn size(&self) -> (u32, u32) {
-        (WIDTH * self.0.len().max(1) as u32, CURVE + COUNTS)
+        let rows = self.0.len().div_ceil(self.columns()).max(1);
+        (SET.0 * self.columns() as u32, SET.1 * rows as u32)
     }
 
-    fn draw<B: DrawingBackend>(&self, area: &DrawingArea<B, Shift>, unit: u32) -> Drawn
-    where
-        B::ErrorType: 'static,
-    {
-        let panels = area.split_evenly((1, self.0.len().max(1)));
-        for (panel, (name, reliability)) in panels.iter().zip(self.0) {
-            let (curve, counts) = panel.split_vertically(CURVE * unit);
-            draw_curve(&curve, unit, name, reliability)?;
-            draw_counts(&counts, unit, reliability)?;
+    fn draw(&self, sheet: &mut Sheet) {
+        for (n, (name, reliability)) in self.0.iter().enumerate() {
+            let place = |index: usize, length: u32| (index as u32 * length) as f64;
+            let (x, y) = (place(n % self.columns(), SET.0), place(n / self.columns(), SET.1));
+            title(sheet, (x + 16.0, y + 12.0), name, "share of poses that are right; pairs");
+            draw_curve(sheet, (x + LEFT, y + TOP), reliability);
+            draw_counts(sheet, (x + LEFT, y + TOP + CURVE.1 + BETWEEN), reliability);
         }
-        Ok(())
     }
 }
 
-fn draw_curve<B: DrawingBackend>(
-    area: &DrawingArea<B, Shift>,
-    unit: u32,
-    name: &str,
-    reliability: &Reliability,
-) -> Drawn
-where
-    B::ErrorType: 'static,
-{
-    let letters = font(LETTERS, unit);
-    let color = COLORS[0];
-    let mut chart = ChartBuilder::on(area)
-        .caption(name, font(CAPTION, unit))
-        .margin(8 * unit)
-        .x_label_area_size(18 * unit)
-        .y_label_area_size(44 * unit)
-        .build_cartesian_2d(0.0..1.0, 0.0..1.0)?;
-    chart
-        .configure_mesh()
-        .label_style(letters)
-        .x_labels(6)
-        .y_labels(6)
-        .y_desc("share right")
-        .bold_line_style(BLACK.mix(0.12))
-        .light_line_style(TRANSPARENT)
-        .draw()?;
-    chart.draw_series(LineSeries::new([(0.0, 0.0), (1.0, 1.0)], BLACK.mix(0.4).stroke_width(unit)))?;
+fn draw_curve(sheet: &mut Sheet, corner: Point, reliability: &Reliability) {
+    let axis = Axis::linear(0.0, 1.0);
+    let chart = Chart { corner, size: CURVE, x: axis, y: axis };
+    chart.panel(sheet);
+    chart.levels(sheet, &axis.ticks());
+    sheet.dashes(vec![chart.at(0.0, 0.0), chart.at(1.0, 1.0)], STROKE / 2.0, Color::QuietText);
     for bin in reliability.bins.iter().filter(|bin| bin.count > 0) {
         let (low, high) = wilson(bin.share_right, bin.count);
-        let x = bin.mean_probability;
-        chart.draw_series([PathElement::new([(x, low), (x, high)], color.stroke_width(unit * 3 / 2))])?;
-        chart.draw_series([Circle::new((x, bin.share_right), 4 * unit, color.filled())])?;
+        let at = |share: f64| chart.at(bin.mean_probability, share);
+        sheet.line(vec![at(low), at(high)], STROKE, Color::Cloud(0));
+        mark(sheet, at(bin.share_right), 0, false);
     }
-    Ok(())
 }
 
-fn draw_counts<B: DrawingBackend>(area: &DrawingArea<B, Shift>, unit: u32, reliability: &Reliability) -> Drawn
-where
-    B::ErrorType: 'static,
-{
-    let letters = font(LETTERS, unit);
+fn draw_counts(sheet: &mut Sheet, corner: Point, reliability: &Reliability) {
     let most = reliability.bins.iter().map(|bin| bin.count).max().unwrap_or(0).max(1) as f64;
-    let mut chart = ChartBuilder::on(area)
-        .margin(8 * unit)
-        .x_label_area_size(34 * unit)
-        .y_label_area_size(44 * unit)
-        .build_cartesian_2d(0.0..1.0, 0.0..most * 1.05)?;
-    chart
-        .configure_mesh()
-        .label_style(letters)
-        .disable_mesh()
-        .x_labels(6)
-        .y_labels(3)
-        .x_desc("probability stated")
-        .y_desc("pairs")
-        .y_label_formatter(&|v| format!("{v:.0}"))
-        .draw()?;
+    let (x, y) = (Axis::linear(0.0, 1.0), Axis::linear(0.0, most));
+    let chart = Chart { corner, size: COUNTS, x, y };
+    chart.panel(sheet);
+    chart.levels(sheet, &[0.0, most]);
+    chart.below(sheet, &x.ticks(), "probability stated");
     for (k, bin) in reliability.bins.iter().enumerate() {
         let side = |edge: usize| edge as f64 / BINS as f64;
-        let bar = [(side(k) + 0.01, 0.0), (side(k + 1) - 0.01, bin.count as f64)];
-        chart.draw_series([Rectangle::new(bar, COLORS[5].filled())])?;
+        let (left, top) = chart.at(side(k), bin.count as f64);
+        let (right, bottom) = chart.at(side(k + 1), 0.0);
+        sheet.rectangle((left + 2.0, top), (right - left - 4.0, bottom - top), 0.0, Color::Quiet);
     }
-    Ok(())
 }
 
 /// The 95 % interval of a share (Wilson, 1927).
@@ -131,8 +104,9 @@ mod tests {
             })
             .collect();
         let reliability = Reliability::of(&observed);
-        let svg = drawing::svg(&picture(&[("shapes", &reliability), ("rooms", &reliability)])).unwrap();
-        assert_eq!(svg.matches("<circle").count(), 4, "{svg}");
+        let svg = drawing::svg(&picture(&[("shapes", &reliability), ("rooms", &reliability)]));
+        // Each with its margin.
+        assert_eq!(svg.matches("<circle").count(), 8, "{svg}");
         assert!(svg.contains("shapes") && svg.contains("rooms"));
     }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use upcr::TRUSTWORTHY;
 
 use super::cases::Kind;
@@ -14,7 +14,7 @@ pub const BINS: usize = 10;
 pub const SURE: f64 = 0.9;
 
 /// Poses said to be right with nearly the same probability.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Bin {
     /// How many.
     pub count: usize,
@@ -25,7 +25,7 @@ pub struct Bin {
 }
 
 /// Right and wrong poses of some pairs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Counts {
     /// Pairs.
     pub pairs: usize,
@@ -40,7 +40,7 @@ pub struct Counts {
 }
 
 /// Reliability over one set of pairs.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Reliability {
     /// Of all pairs.
     pub counts: Counts,
