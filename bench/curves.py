@@ -9,8 +9,9 @@ import matplotlib
 matplotlib.use("svg")
 import matplotlib.pyplot as plt
 
-# Colours that the colour-blind can tell apart (Okabe and Ito), and marks for those who print in grey.
-COLOURS = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"]
+# The palette of the reports (web/report/style.css), and marks for those who print in grey.
+TEXT, QUIET_TEXT, LINE, CANVAS = "#1b2126", "#5a656e", "#d9dee2", "#f2f4f5"
+COLOURS = ["#cf5f0c", "#11678f", "#5f8a1d", "#7d55b5", "#b8447e", "#6b6357"]
 MARKS = ["o", "s", "^", "D", "v", "P"]
 
 
@@ -27,6 +28,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="the picture, SVG or PNG")
     options = parser.parse_args()
 
+    matplotlib.rcParams.update({
+        "svg.hashsalt": "curves", "svg.fonttype": "none", "font.family": ["sans-serif"], "text.color": TEXT,
+        "axes.facecolor": CANVAS, "axes.edgecolor": CANVAS, "axes.labelcolor": QUIET_TEXT, "axes.titlelocation": "left",
+        "axes.titleweight": 600, "grid.color": LINE, "xtick.color": QUIET_TEXT, "ytick.color": QUIET_TEXT,
+        "legend.edgecolor": LINE,
+    })
     figure, (loss, error) = plt.subplots(1, 2, figsize=(9.6, 3.8), layout="constrained")
     for n, text in enumerate(options.runs):
         name, folder = text.split("=", 1)
@@ -35,15 +42,14 @@ def main() -> None:
         style = {"color": COLOURS[n % len(COLOURS)], "marker": MARKS[n % len(MARKS)], "markersize": 4, "label": name}
         loss.plot(steps, [point["val_loss"] for point in points], **style)
         error.plot(steps, [point["val_mae_r_deg"] for point in points], **style)
-    loss.set(title="held out: Chamfer loss", xlabel="steps", yscale="log")
-    error.set(title="held out: MAE(R), degrees", xlabel="steps", yscale="log")
+    loss.set(title="Held out: Chamfer loss", xlabel="steps", yscale="log")
+    error.set(title="Held out: MAE(R), degrees", xlabel="steps", yscale="log")
     error.yaxis.set_major_formatter("{x:g}")
     error.yaxis.set_minor_formatter("{x:g}")
     for axes in (loss, error):
-        axes.grid(alpha=0.3, which="both")
-        axes.spines[["top", "right"]].set_visible(False)
-    error.legend(frameon=False)
-    matplotlib.rcParams["svg.hashsalt"] = "curves"
+        axes.grid(axis="y", which="both")
+        axes.set_axisbelow(True)
+    error.legend()
     figure.savefig(options.out, metadata={"Date": None} if options.out.suffix == ".svg" else None)
 
 

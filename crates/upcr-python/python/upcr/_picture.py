@@ -10,7 +10,8 @@ from ._cloud import FloatArray
 
 _SIZE = 240
 _MARGIN = 12
-_SOURCE, _TARGET = "#d95f02", "#4477aa"
+# As in the reports: --cloud-0, --cloud-1, --quiet-text.
+_SOURCE, _TARGET, _QUIET = "#cf5f0c", "#11678f", "#5a656e"
 
 
 def page(lines: list[tuple[str, str]], clouds: tuple[FloatArray, FloatArray], pose: FloatArray) -> str:
@@ -40,7 +41,7 @@ def drawing(clouds: tuple[FloatArray, FloatArray], pose: FloatArray) -> str:
     )
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}" '
-        f'font-family="sans-serif" font-size="11" fill="#666">{"".join(panels)}{legend}</svg>'
+        f'font-family="system-ui, sans-serif" font-size="11" fill="{_QUIET}">{"".join(panels)}{legend}</svg>'
     )
 
 
