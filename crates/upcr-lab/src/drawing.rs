@@ -5,7 +5,7 @@ mod png;
 mod style;
 mod svg;
 
-pub use chart::{Axis, Chart, key, mark, set_apart, short, title};
+pub use chart::{Axis, Chart, key, key_height, mark, set_apart, short, title};
 pub use png::png;
 pub use style::{Color, Letters, NAME, QUIET, STROKE, TITLE};
 pub use svg::svg;

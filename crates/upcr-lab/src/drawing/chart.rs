@@ -111,6 +111,13 @@ impl Chart {
         sheet.text((self.corner.0 + INSET, bottom + 14.0 + LINE), name, QUIET, Anchor::Start);
     }
 
+    /// Says at the left end that what is there may be less.
+    pub fn lowest(&self, sheet: &mut Sheet, value: f64) {
+        let (x, _) = self.at(self.x.from, self.y.from);
+        let bottom = self.corner.1 + self.size.1;
+        sheet.text((x, bottom + 14.0), format!("≤ {}", short(value)), QUIET, Anchor::Middle);
+    }
+
     /// Rules at some places from left to right.
     pub fn columns(&self, sheet: &mut Sheet, ticks: &[f64]) {
         for &tick in ticks {
@@ -126,9 +133,14 @@ pub fn title(sheet: &mut Sheet, (x, y): Point, text: &str, remark: &str) {
     sheet.text((x, y + 1.5 * LINE), remark, QUIET, Anchor::Start);
 }
 
+/// Height of a key with so many entries.
+pub fn key_height(entries: usize) -> f64 {
+    LINE * entries as f64 + 12.0
+}
+
 /// What marks stand for, in a box of the reports' kind: each by how it is drawn.
 pub fn key(sheet: &mut Sheet, (x, y): Point, width: f64, entries: &[(String, &dyn Fn(&mut Sheet, Point))]) {
-    let height = LINE * entries.len() as f64 + 12.0;
+    let height = key_height(entries.len());
     sheet.rectangle((x, y), (width, height), ROUND, Color::Line);
     let inside = (width - 2.0 * RULE, height - 2.0 * RULE);
     sheet.rectangle((x + RULE, y + RULE), inside, ROUND - RULE, Color::Page);
@@ -225,7 +237,8 @@ mod tests {
         let (x, y) = (Axis::logarithmic(0.1, 10.0), Axis::linear(0.0, 4.0));
         let chart = Chart { corner: (5.0, 7.0), size, x, y };
         assert_eq!(chart.at(0.1, 0.0), (15.0, 117.0));
-        assert_eq!(chart.at(1.0, 1.0), (115.0, 92.0));
+        let (x, y) = chart.at(1.0, 1.0);
+        assert!((x - 115.0).abs() < 1e-9 && y == 92.0, "{x} {y}");
         assert_eq!(chart.at(0.0, 9.0), (15.0, 17.0));
     }
 

@@ -11,7 +11,7 @@ use super::{Anchor, Color, DASH, Letters, Picture, Point, Shape, Sheet};
 /// Pixels a unit.
 const PIXELS: f64 = 2.0;
 /// The letters at hand are light: they are drawn so often, so many units apart, for text and for titles.
-const WEIGHTS: (usize, usize, f64) = (2, 4, 0.2);
+const WEIGHTS: (usize, usize, f64) = (2, 6, 0.2);
 /// Handles of the curve that is nearly a quarter of a circle, as a share of its radius.
 const QUARTER: f64 = 0.5523;
 
@@ -275,8 +275,9 @@ mod tests {
     fn shapes_cover_their_areas() {
         let (color, pixels) = (Color::Text, PIXELS * PIXELS);
         let corner = (1.25, 2.5);
-        let close =
-            |found: f64, wanted: f64| assert!((found - wanted * pixels).abs() < 0.6, "{found} {wanted}");
+        let close = |found: f64, wanted: f64| {
+            assert!((found / (wanted * pixels) - 1.0).abs() < 0.01, "{found} {wanted}")
+        };
         close(
             ink(Shape::Circle { center: (7.3, 4.9), radius: 3.2, color }),
             3.2 * 3.2 * std::f64::consts::PI,

@@ -4,7 +4,7 @@ use super::description::{Plot, PlotKind};
 use super::report::{Spread, heading};
 use super::reproduce::Outcome;
 use crate::drawing::{
-    Anchor, Axis, Chart, Color, NAME, Picture, Point, STROKE, Sheet, key, mark, set_apart, title,
+    Anchor, Axis, Chart, Color, NAME, Picture, Point, STROKE, Sheet, key, key_height, mark, set_apart, title,
 };
 
 /// The experiment's picture; `None` where it has none, or nothing above zero was measured.
@@ -31,15 +31,20 @@ struct Drawing<'a> {
     marks: Vec<Mark>,
 }
 
-/// Lengths in units: a row's height, the picture's width, the places of panels.
-const ROW: f64 = 26.0;
+/// Lengths in units: from a setting's marks to the next, what a row has beside, the picture's width, the places of
+/// panels.
+const SETTING: f64 = 7.0;
+const ROW: f64 = 12.0;
 const WIDTH: f64 = 980.0;
 const TOP: f64 = 64.0;
-const BOTTOM: f64 = 56.0;
+const BOTTOM: f64 = 34.0;
+const BELOW: f64 = 20.0;
 const NAMES: f64 = 220.0;
 const NUMBERS: f64 = 52.0;
 const BESIDE: f64 = 190.0;
 const LINES: f64 = 380.0;
+/// Where the name of the lowest value ends, in units from a panel's left.
+const LOWEST: f64 = 60.0;
 /// Share of the largest value down to which a logarithmic axis reaches.
 const SMALLEST: f64 = 2e-4;
 
@@ -82,6 +87,11 @@ impl<'a> Drawing<'a> {
         (low, high)
     }
 
+    /// Height of a row.
+    fn row(&self) -> f64 {
+        ROW + SETTING * self.settings.len().max(2) as f64
+    }
+
     /// Over a logarithmic axis, where values differ tenfold.
     fn dots(&self, sheet: &mut Sheet) {
         // A method may be right to the last bit: what is below a share of the largest is drawn at it.
@@ -92,23 +102,30 @@ impl<'a> Drawing<'a> {
             false => Axis::linear(0.0, high),
         };
         let count = self.methods.len() as f64;
-        let size = (WIDTH - NAMES - BESIDE, ROW * count);
+        let height = self.row();
+        let size = (WIDTH - NAMES - BESIDE, height * count);
         let chart = Chart { corner: (NAMES, TOP), size, x, y: Axis::linear(0.0, 1.0) };
         chart.panel(sheet);
         chart.columns(sheet, &x.ticks());
-        chart.below(sheet, &x.ticks(), "");
-        let row = |method: usize| TOP + ROW * (method as f64 + 0.5);
+        let mut named = x.ticks();
+        if low < least {
+            // Rounded up, so that it holds.
+            let digit = 10f64.powi(least.log10().floor() as i32);
+            chart.lowest(sheet, (least / digit).ceil() * digit);
+            named.retain(|&tick| chart.at(tick, 0.0).0 > NAMES + LOWEST);
+        }
+        chart.below(sheet, &named, "");
+        let row = |method: usize| TOP + height * (method as f64 + 0.5);
         for (index, name) in self.methods.iter().enumerate() {
             sheet.text((NAMES - 10.0, row(index)), plain(name), NAME, Anchor::End);
             if index > 0 {
-                let y = row(index) - ROW / 2.0;
+                let y = row(index) - height / 2.0;
                 sheet.rule((NAMES, y), (NAMES + size.0, y));
             }
         }
         let sets = self.settings.len() as f64;
         // Settings one below the other.
-        let shift =
-            |setting: usize| if sets > 1.0 { 9.0 * (setting as f64 / (sets - 1.0) - 0.5) } else { 0.0 };
+        let shift = |setting: usize| SETTING * (setting as f64 - (sets - 1.0) / 2.0);
         let at = |mark: &Mark, value: f64| (chart.at(value, 0.0).0, row(mark.method) + shift(mark.setting));
         for mark in &self.marks {
             let (from, to) = (mark.value.mean - deviation(mark), mark.value.mean + deviation(mark));
@@ -171,8 +188,11 @@ impl<'a> Drawing<'a> {
 impl Picture for Drawing<'_> {
     fn size(&self) -> (u32, u32) {
         let panel = match self.plot.kind {
-            PlotKind::Dots => ROW * self.methods.len() as f64,
-            PlotKind::Lines => LINES,
+            PlotKind::Dots => {
+                let rows = self.row() * self.methods.len() as f64;
+                rows.max(key_height(self.settings.len() + 1))
+            }
+            PlotKind::Lines => LINES + BELOW,
         };
         (WIDTH as u32, (TOP + panel + BOTTOM) as u32)
     }

@@ -7,12 +7,13 @@ use upcr::Result;
 
 use super::history::Event;
 use crate::drawing::{
-    self, Anchor, Axis, Chart, Color, NAME, Picture, Point, QUIET, STROKE, Sheet, set_apart, title,
+    self, Anchor, Axis, Chart, Color, NAME, Picture, Point, STROKE, Sheet, set_apart, title,
 };
 use crate::files::write_atomically;
 
 /// Lengths in units: of the picture, of a panel and its surroundings.
-const SIZE: (u32, u32) = (960, 380);
+const SIZE: (u32, u32) = (876, 380);
+const SECOND: f64 = 480.0;
 const PANEL: Point = (318.0, 260.0);
 const TOP: f64 = 64.0;
 const LEFT: f64 = 60.0;
@@ -48,12 +49,7 @@ impl Picture for LearningCurve<'_> {
         ];
         panel(sheet, 0.0, ("Loss", "of pairs learned from and held out"), &loss);
         let error = [("held out", held_out, false, at(|e| e.validation.map(|v| v.mae_r_deg)))];
-        panel(
-            sheet,
-            f64::from(SIZE.0) / 2.0,
-            ("Rotation error", "MAE(R) of pairs held out, degrees"),
-            &error,
-        );
+        panel(sheet, SECOND, ("Rotation error", "MAE(R) of pairs held out, degrees"), &error);
     }
 }
 
@@ -89,12 +85,7 @@ fn panel(sheet: &mut Sheet, left: f64, (name, remark): (&str, &str), lines: &[Li
     for ((&end, y), (name, color, ..)) in ends.iter().zip(heights).zip(&lines) {
         sheet.circle(end, 3.5, *color);
         if lines.len() > 1 {
-            sheet.text(
-                (beside, y),
-                *name,
-                if *color == Color::Cloud(0) { QUIET } else { NAME },
-                Anchor::Start,
-            );
+            sheet.text((beside, y), *name, NAME, Anchor::Start);
         }
     }
 }

@@ -1,17 +1,17 @@
 //! Reliability as a picture: what was said against what was true, and how often it was said.
 
 use super::reliability::{BINS, Reliability};
-use crate::drawing::{Axis, Chart, Color, Picture, Point, STROKE, Sheet, mark, title};
+use crate::drawing::{Anchor, Axis, Chart, Color, Picture, Point, QUIET, STROKE, Sheet, mark, title};
 
 /// Sets that stand beside each other: as many as fit, and of more two.
 const BESIDE: usize = 3;
 /// Lengths in units: of a set's part of the picture, of its panels and their places.
-const SET: (u32, u32) = (330, 450);
+const SET: (u32, u32) = (330, 462);
 const CURVE: Point = (262.0, 262.0);
 const COUNTS: Point = (262.0, 60.0);
 const LEFT: f64 = 52.0;
 const TOP: f64 = 64.0;
-const BETWEEN: f64 = 12.0;
+const BETWEEN: f64 = 26.0;
 
 /// A panel for each set of pairs.
 pub fn picture<'a>(sets: &'a [(&'a str, &'a Reliability)]) -> impl Picture + 'a {
@@ -39,7 +39,7 @@ impl Picture for Panels<'_> {
         for (n, (name, reliability)) in self.0.iter().enumerate() {
             let place = |index: usize, length: u32| (index as u32 * length) as f64;
             let (x, y) = (place(n % self.columns(), SET.0), place(n / self.columns(), SET.1));
-            title(sheet, (x + 16.0, y + 12.0), name, "share of poses that are right; pairs");
+            title(sheet, (x + 16.0, y + 12.0), name, "share of poses that are right");
             draw_curve(sheet, (x + LEFT, y + TOP), reliability);
             draw_counts(sheet, (x + LEFT, y + TOP + CURVE.1 + BETWEEN), reliability);
         }
@@ -65,6 +65,7 @@ fn draw_counts(sheet: &mut Sheet, corner: Point, reliability: &Reliability) {
     let (x, y) = (Axis::linear(0.0, 1.0), Axis::linear(0.0, most));
     let chart = Chart { corner, size: COUNTS, x, y };
     chart.panel(sheet);
+    sheet.text((corner.0, corner.1 - BETWEEN / 2.0), "pairs", QUIET, Anchor::Start);
     chart.levels(sheet, &[0.0, most]);
     chart.below(sheet, &x.ticks(), "probability stated");
     for (k, bin) in reliability.bins.iter().enumerate() {
