@@ -133,20 +133,23 @@ pub fn title(sheet: &mut Sheet, (x, y): Point, text: &str, remark: &str) {
     sheet.text((x, y + 1.5 * LINE), remark, QUIET, Anchor::Start);
 }
 
+/// A name, and the index of its mark and whether that is hollow.
+pub type Entry = (String, usize, bool);
+
 /// Height of a key with so many entries.
 pub fn key_height(entries: usize) -> f64 {
     LINE * entries as f64 + 12.0
 }
 
-/// What marks stand for, in a box of the reports' kind: each by how it is drawn.
-pub fn key(sheet: &mut Sheet, (x, y): Point, width: f64, entries: &[(String, &dyn Fn(&mut Sheet, Point))]) {
+/// What marks stand for, in a box of the reports' kind.
+pub fn key(sheet: &mut Sheet, (x, y): Point, width: f64, entries: &[Entry]) {
     let height = key_height(entries.len());
     sheet.rectangle((x, y), (width, height), ROUND, Color::Line);
     let inside = (width - 2.0 * RULE, height - 2.0 * RULE);
     sheet.rectangle((x + RULE, y + RULE), inside, ROUND - RULE, Color::Page);
-    for (n, (name, draw)) in entries.iter().enumerate() {
+    for (n, (name, index, hollow)) in entries.iter().enumerate() {
         let at = y + 6.0 + LINE * (n as f64 + 0.5);
-        draw(sheet, (x + 15.0, at));
+        mark(sheet, (x + 15.0, at), *index, *hollow);
         sheet.text((x + 28.0, at), name.as_str(), NAME, Anchor::Start);
     }
 }

@@ -260,7 +260,9 @@ mod tests {
     fn paper(shapes: &[Shape]) -> Paper {
         let font = FontRef::try_from_slice(epaint_default_fonts::UBUNTU_LIGHT).unwrap();
         let mut paper = Paper::new(20, 10);
-        shapes.iter().for_each(|shape| paper.put(shape, &font));
+        for shape in shapes {
+            paper.put(shape, &font);
+        }
         paper
     }
 
@@ -276,7 +278,7 @@ mod tests {
         let (color, pixels) = (Color::Text, PIXELS * PIXELS);
         let corner = (1.25, 2.5);
         let close = |found: f64, wanted: f64| {
-            assert!((found / (wanted * pixels) - 1.0).abs() < 0.01, "{found} {wanted}")
+            assert!((found / (wanted * pixels) - 1.0).abs() < 0.01, "{found} {wanted}");
         };
         close(
             ink(Shape::Circle { center: (7.3, 4.9), radius: 3.2, color }),

@@ -2,24 +2,27 @@
 
 use std::fmt::{Display, Formatter, Result, Write};
 
-use super::style::{FAMILY, PALETTE};
+use super::style::{FAMILY, PALETTE, Tones};
 use super::{Anchor, Color, DASH, Picture, Shape, Sheet};
 
 /// The picture as SVG.
 pub fn svg(picture: &impl Picture) -> String {
     let (width, height) = picture.size();
     let Sheet(shapes) = Sheet::of(picture);
-    let rules = |tone: fn(usize) -> u32| -> String {
-        (0..PALETTE.len()).map(|n| format!(".{}{{color:#{:06x}}}", PALETTE[n].name, tone(n))).collect()
+    // Writing to a string cannot fail.
+    let rules = |tone: fn(&Tones) -> u32| {
+        PALETTE.iter().fold(String::new(), |mut rules, tones| {
+            let _ = write!(rules, ".{}{{color:#{:06x}}}", tones.name, tone(tones));
+            rules
+        })
     };
     let mut text = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{width}\" height=\"{height}\" viewBox=\"0 0 {width} {height}\" \
          font-family=\"{FAMILY}\">\n<style>\n{}\n@media (prefers-color-scheme:dark){{\n{}\n}}\n</style>\n",
-        rules(|n| PALETTE[n].light),
-        rules(|n| PALETTE[n].dark),
+        rules(|tones| tones.light),
+        rules(|tones| tones.dark),
     );
     for shape in shapes {
-        // Writing to a string cannot fail.
         let _ = writeln!(text, "{shape}");
     }
     text + "</svg>\n"

@@ -97,9 +97,10 @@ impl<'a> Drawing<'a> {
         // A method may be right to the last bit: what is below a share of the largest is drawn at it.
         let (low, high) = self.range();
         let least = low.clamp(high * SMALLEST, high);
-        let x = match high > 10.0 * least {
-            true => Axis::logarithmic(least * 0.9, high * 1.1),
-            false => Axis::linear(0.0, high),
+        let x = if high > 10.0 * least {
+            Axis::logarithmic(least * 0.9, high * 1.1)
+        } else {
+            Axis::linear(0.0, high)
         };
         let count = self.methods.len() as f64;
         let height = self.row();
@@ -143,16 +144,11 @@ impl<'a> Drawing<'a> {
 
     /// What the marks of [`dots`](Self::dots) stand for.
     fn draw_key(&self, sheet: &mut Sheet) {
-        let filled: Vec<_> = (0..self.settings.len())
-            .map(|index| move |sheet: &mut Sheet, at: Point| mark(sheet, at, index, false))
-            .collect();
-        let hollow = |sheet: &mut Sheet, at: Point| mark(sheet, at, 0, true);
-        let mut entries: Vec<(String, &dyn Fn(&mut Sheet, Point))> = Vec::new();
-        for ((name, _), draw) in self.settings.iter().zip(&filled) {
-            entries.push(((*name).to_owned(), draw));
-        }
+        let settings = self.settings.iter().enumerate();
+        let mut entries: Vec<_> =
+            settings.map(|(index, (name, _))| ((*name).to_owned(), index, false)).collect();
         if self.marks.iter().any(|mark| mark.of_paper) {
-            entries.push(("hollow: the paper".to_owned(), &hollow));
+            entries.push(("hollow: the paper".to_owned(), 0, true));
         }
         key(sheet, (WIDTH - BESIDE + 14.0, TOP), BESIDE - 30.0, &entries);
     }
@@ -174,7 +170,9 @@ impl<'a> Drawing<'a> {
                 .collect();
             ends.push(points.last().map_or(0.0, |end| end.1));
             sheet.line(points.clone(), STROKE, Color::Cloud(index));
-            points.into_iter().for_each(|at| mark(sheet, at, index, false));
+            for at in points {
+                mark(sheet, at, index, false);
+            }
         }
         // Lines are named where they end.
         let beside = NUMBERS + size.0 + 14.0;
