@@ -29,9 +29,9 @@ def main() -> None:
     options = parser.parse_args()
 
     matplotlib.rcParams.update({
-        "svg.hashsalt": "curves", "svg.fonttype": "none", "font.family": ["sans-serif"], "text.color": TEXT,
+        "svg.hashsalt": "curves", "text.color": TEXT,
         "axes.facecolor": CANVAS, "axes.edgecolor": CANVAS, "axes.labelcolor": QUIET_TEXT, "axes.titlelocation": "left",
-        "axes.titleweight": 600, "grid.color": LINE, "xtick.color": QUIET_TEXT, "ytick.color": QUIET_TEXT,
+        "axes.titleweight": "semibold", "grid.color": LINE, "xtick.color": QUIET_TEXT, "ytick.color": QUIET_TEXT,
         "legend.edgecolor": LINE,
     })
     figure, (loss, error) = plt.subplots(1, 2, figsize=(9.6, 3.8), layout="constrained")
