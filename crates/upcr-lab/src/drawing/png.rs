@@ -205,7 +205,7 @@ impl Outline {
     fn stroke(&mut self, points: &[Point], half: f64) {
         for pair in points.windows(2) {
             let ((x0, y0), (x1, y1)) = (pair[0], pair[1]);
-            let length = (x1 - x0).hypot(y1 - y0);
+            let length = distance(pair[0], pair[1]);
             if length > 0.0 {
                 let (dx, dy) = ((y1 - y0) / length * half, (x0 - x1) / length * half);
                 self.polygon(&[
@@ -222,6 +222,11 @@ impl Outline {
     }
 }
 
+/// By what is rounded alike on every machine.
+fn distance((x0, y0): Point, (x1, y1): Point) -> f64 {
+    ((x1 - x0) * (x1 - x0) + (y1 - y0) * (y1 - y0)).sqrt()
+}
+
 /// A line's dashes.
 fn dashes(points: &[Point]) -> Vec<Vec<Point>> {
     let (on, off) = DASH;
@@ -229,7 +234,7 @@ fn dashes(points: &[Point]) -> Vec<Vec<Point>> {
     let (mut drawn, mut left) = (true, on);
     for pair in points.windows(2) {
         let (from, to) = (pair[0], pair[1]);
-        let length = (to.0 - from.0).hypot(to.1 - from.1);
+        let length = distance(from, to);
         let at = |along: f64| {
             let share = along / length;
             (from.0 + share * (to.0 - from.0), from.1 + share * (to.1 - from.1))
