@@ -228,7 +228,7 @@ fn here() -> Result<ProxyUri> {
     }
     let mut command = Command::new("rerun");
     command
-        .arg(format!("--port={}", address.port()))
+        .args([format!("--bind={}", address.ip()), format!("--port={}", address.port())])
         .args(["--hide-welcome-screen", "--expect-data-soon"])
         // What it says is no answer of ours, and whoever reads ours need not wait for it to end.
         .stdin(Stdio::null())

@@ -19,7 +19,7 @@ mod with_the_feature {
     use std::collections::BTreeMap;
     use std::fs::File;
     use std::io::{self, BufReader};
-    use std::net::TcpListener;
+    use std::net::{TcpListener, TcpStream};
     use std::time::{Duration, Instant};
 
     use re_sdk::external::re_log_encoding::DecoderApp;
@@ -234,6 +234,32 @@ mod with_the_feature {
         upcr(["register", "no.ply", "no.ply", "--rerun=rerun+http://127.0.0.1:1/proxy"])
             .assert_fails(1, &["--rerun", "no viewer answers at rerun+http://127.0.0.1:1/proxy"]);
         assert!(start.elapsed() < Duration::from_secs(20));
+    }
+
+    #[test]
+    fn rerun_says_where_a_viewer_would_come_from() {
+        if TcpStream::connect(("127.0.0.1", re_sdk::DEFAULT_SERVER_PORT)).is_ok() {
+            println!("skipped: a viewer runs on this machine");
+            return;
+        }
+        let scratch = Scratch::new();
+        let run = || {
+            let args = ["register", "no.ply", "no.ply", "--rerun"];
+            let output = command().args(args).env("PATH", scratch.path("")).output().unwrap();
+            (output.status.code(), String::from_utf8(output.stderr).unwrap())
+        };
+        let (status, words) = run();
+        assert_eq!(status, Some(1));
+        assert!(words.starts_with("error: --rerun: no viewer runs at 127.0.0.1:9876"), "{words}");
+        assert!(words.contains("rerun-sdk=="), "{words}");
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt;
+            let program = scratch.file("rerun", "#!/bin/sh\nexit 7\n");
+            std::fs::set_permissions(program, std::fs::Permissions::from_mode(0o755)).unwrap();
+            let (status, words) = run();
+            assert!(status == Some(1) && words.contains("ended at once") && words.contains('7'), "{words}");
+        }
     }
 
     #[test]
