@@ -40,8 +40,8 @@ web:
 
 # Check what streams to Rerun, which nothing else builds
 rerun:
-    cargo clippy -p upcr-cli --all-targets --features rerun --locked -- -D warnings
-    cargo test -p upcr-cli --features rerun --locked rerun
+    cargo clippy -p upcr-cli --all-targets --features rerun --profile quick --locked -- -D warnings
+    cargo test -p upcr-cli --features rerun --profile quick --locked rerun
 
 # Format the code
 fmt:

@@ -247,7 +247,10 @@ fn here() -> Result<ProxyUri> {
     let start = Instant::now();
     while !listens() {
         if let Some(status) = viewer.try_wait()?.filter(|status| !status.success()) {
-            bail!("the viewer `rerun` ended at once, with {status}");
+            bail!(
+                "the viewer `rerun` ended at once, with {status}; where there is no display, start \
+                 `rerun --serve-web` and say its address"
+            );
         }
         if start.elapsed() > STARTING {
             bail!("the viewer `rerun` did not come up in {} s", STARTING.as_secs());
