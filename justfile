@@ -38,6 +38,11 @@ web:
     cargo build --release -p upcr-cli
     web/test
 
+# Check what streams to Rerun, which nothing else builds
+rerun:
+    cargo clippy -p upcr-cli --all-targets --features rerun --profile quick --locked -- -D warnings
+    cargo test -p upcr-cli --features rerun --profile quick --locked rerun
+
 # Format the code
 fmt:
     cargo fmt

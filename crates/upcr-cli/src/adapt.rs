@@ -15,6 +15,7 @@ use upcr_lab::train::{ADAPTATION_EPOCHS, ADAPTATION_RATE, Alone, Material, Poses
 use crate::Status;
 use crate::output;
 use crate::pairs::Pairs;
+use crate::stream::Streaming;
 use crate::train::{Backend, Teller};
 
 const AFTER_HELP: &str = "\
@@ -67,6 +68,8 @@ pub struct Args {
     /// Folder for the results; made where missing
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    #[command(flatten)]
+    stream: Streaming,
 }
 
 /// Part of a data set.
@@ -95,6 +98,7 @@ pub fn run(args: &Args) -> Result<Status> {
 }
 
 fn learn(args: &Args) -> Result<Status> {
+    let stream = args.stream.open("adapt")?;
     let (path, bytes) = match &args.weights {
         Some(path) => (path.as_path(), std::fs::read(path).with_context(|| path.display().to_string())?),
         None => (Path::new("the weights inside"), EMBEDDED_WEIGHTS.to_vec()),
@@ -116,7 +120,7 @@ fn learn(args: &Args) -> Result<Status> {
         mixture: args.protocol.mixture(args.partial),
         poses: if args.fixed_pairs { Poses::Fixed } else { Poses::Fresh },
     };
-    let mut teller = Teller::new()?;
+    let mut teller = Teller::new(stream)?;
     let done = adapt(&network, &material, config.clone(), &args.out, &mut Alone, &mut teller)?;
     let path = args.out.join("weights.safetensors");
     write_atomically(&path, &done.network.store().to_bytes()?)?;
@@ -133,6 +137,7 @@ fn learn(args: &Args) -> Result<Status> {
     });
     let report = serde_json::to_string_pretty(&report)?;
     write_atomically(&args.out.join("adaptation.json"), report.as_bytes())?;
+    teller.close()?;
     if !done.finished {
         output::note("stopped early; the same command goes on");
     }

@@ -16,6 +16,7 @@ mod pairs;
 mod register;
 #[cfg(feature = "train")]
 mod reproduce;
+mod stream;
 mod synth;
 #[cfg(feature = "train")]
 mod train;

@@ -5,6 +5,7 @@ use std::fs::File;
 use std::io::{BufRead, BufReader, stdin};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result, bail};
@@ -14,13 +15,14 @@ use serde_json::Value;
 use upcr::features::MatchedFeature;
 use upcr::net::Network;
 use upcr::{
-    Calibration, Locks, Method, PointCloud, Refinement, Registration, Rigid, RobustKernel, Settings, Watch,
-    io,
+    Calibration, Locks, Method, PointCloud, PoseStep, Refinement, Registration, Rigid, RobustKernel,
+    Settings, Watch, io,
 };
 use upcr_lab::files::write_atomically;
 use upcr_report::Page;
 
 use crate::output::{self, Progress};
+use crate::stream::{Stream, Streaming};
 use crate::{Status, describe, input};
 
 /// Find the pose that lays SOURCE on TARGET
@@ -35,7 +37,7 @@ pub struct Args {
     target: Option<PathBuf>,
     /// Register many pairs: a file (`-`: stdin) with SOURCE, TARGET and, if any, the first guess's file on each
     /// line, separated by tabs or blanks. Prints one JSON object a line, in the same order, as soon as it is known
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["source", "target", "init", "output", "transform", "report"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["source", "target", "init", "output", "transform", "report", "rerun"])]
     pairs: Option<PathBuf>,
     /// Where the first pose comes from
     #[arg(long, value_enum, default_value_t = Settings::default().method)]
@@ -91,6 +93,8 @@ pub struct Args {
     /// alternatives, and the pose to copy
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
+    #[command(flatten)]
+    stream: Streaming,
     /// Print one JSON object instead of a summary
     #[arg(long)]
     json: bool,
@@ -185,11 +189,13 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status
     if let Some(path) = &args.output {
         io::check_writable(path)?;
     }
+    let stream = args.stream.open(&format!("{} -> {}", source_path.display(), target_path.display()))?;
     let mut progress = Progress::new();
     progress.step("reading");
     let source = args.reading.read(source_path)?;
     let target = args.reading.read(target_path)?;
-    let found = register(&source, &target, &settings, &mut progress)
+    let shown = stream.map(|stream| Shown::new(stream, &source, &target, &settings));
+    let found = register(&source, &target, &settings, &mut progress, shown.as_ref())
         .map_err(|error| input::name_file(error, source_path, target_path))?;
     progress.step("writing");
     if let Some(path) = &args.transform {
@@ -204,6 +210,10 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status
         let page = Page::of_registration((&a, &source), (&b, &target), &found).with_comments(&comments);
         write_atomically(path, page.html()?.as_bytes())?;
     }
+    let summary = summary(&found, args, source_path, target_path);
+    if let Some(shown) = shown {
+        shown.end(&found, &summary)?;
+    }
     drop(progress);
 
     let trusted = found.is_trustworthy();
@@ -213,7 +223,7 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status
     if args.json {
         output::answer_json(&args.told(&found)?)?;
     } else {
-        output::answer(&summary(&found, args, source_path, target_path))?;
+        output::answer(&summary)?;
     }
     Ok(if trusted { Status::Done } else { Status::NotRegistered })
 }
@@ -282,15 +292,89 @@ fn register(
     target: &PointCloud,
     settings: &Settings,
     progress: &mut Progress,
+    shown: Option<&Shown>,
 ) -> upcr::Result<Registration> {
     let progress = Mutex::new(progress);
     let show = |at: upcr::Progress| {
         let method = at.method.and_then(|m| m.to_possible_value());
         let method = method.map_or_else(String::new, |m| format!(" ({})", m.get_name()));
         let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
-        progress.step(&format!("{}{method}, {:.0} %", at.stage, 100.0 * at.done));
+        let stage = format!("{}{method}", at.stage);
+        progress.step(&format!("{stage}, {:.0} %", 100.0 * at.done));
+        if let Some(shown) = shown {
+            shown.stage(stage);
+        }
     };
-    upcr::register_watched(source, target, settings, &Watch { progress: Some(&show), ..Watch::default() })
+    let hear = |step: PoseStep| {
+        if let Some(shown) = shown {
+            shown.step(&step);
+        }
+    };
+    let poses = shown.is_some().then_some(&hear as &(dyn Fn(PoseStep) + Sync));
+    upcr::register_watched(
+        source,
+        target,
+        settings,
+        &Watch { progress: Some(&show), poses, ..Watch::default() },
+    )
+}
+
+/// A registration as it is streamed: the source moves from pose to pose, the first guess at `iteration` 0, the answer at the
+/// last.
+struct Shown {
+    stream: Stream,
+    iteration: AtomicU64,
+    stage: Mutex<String>,
+}
+
+impl Shown {
+    fn new(mut stream: Stream, source: &PointCloud, target: &PointCloud, settings: &Settings) -> Self {
+        stream.cloud("target", target, 1);
+        stream.cloud("source", source, 0);
+        stream.pose("target", &Rigid::identity());
+        stream.at("iteration", 0);
+        stream.pose("source", &settings.init.unwrap_or_else(Rigid::identity));
+        Self { stream, iteration: AtomicU64::new(0), stage: Mutex::default() }
+    }
+
+    fn stage(&self, now: String) {
+        let mut stage = self.stage.lock().unwrap_or_else(PoisonError::into_inner);
+        if *stage != now {
+            self.stream.say(&now);
+            *stage = now;
+        }
+    }
+
+    fn step(&self, step: &PoseStep) {
+        self.move_source(&step.T_target_source);
+        if step.iteration == 0 {
+            self.stream.say(&format!("hypothesis {} is refined", step.hypothesis + 1));
+        }
+        if let Some(pairs) = step.pairs {
+            let level = if step.fine { "fine" } else { "coarse" };
+            self.stream.number(&format!("rmse/{level}"), pairs.rmse);
+            self.stream.number(&format!("paired/{level}"), pairs.share);
+        }
+    }
+
+    fn move_source(&self, T_target_source: &Rigid) {
+        let iteration = self.iteration.fetch_add(1, Ordering::Relaxed) + 1;
+        self.stream.at("iteration", iteration);
+        self.stream.pose("source", T_target_source);
+    }
+
+    fn end(self, found: &Registration, summary: &str) -> Result<()> {
+        self.move_source(&found.T_target_source);
+        self.stream.say(if found.is_trustworthy() { "registered" } else { "not registered" });
+        for reason in &found.reasons {
+            self.stream.say(&format!("caveat: {reason}"));
+        }
+        self.stream.number("verdict/probability", found.probability);
+        self.stream.number("verdict/fitness", found.fitness);
+        self.stream.number("rmse/answer", found.inlier_rmse);
+        self.stream.document("summary", summary);
+        self.stream.close()
+    }
 }
 
 fn register_pair(

@@ -84,7 +84,7 @@ fn reproduce(args: &Args) -> Result<Status> {
         budget_name: args.budget.clone(),
         device: args.backend.device(),
     };
-    let results = reproduction.run(&chosen, &mut Teller::new()?)?;
+    let results = reproduction.run(&chosen, &mut Teller::new(None)?)?;
     let command = format!("upcr reproduce {} --budget {}", args.names.join(" "), args.budget);
     let path = args.out.join("report.md");
     write_atomically(&args.out.join("results.json"), serde_json::to_string_pretty(&results)?.as_bytes())?;

@@ -16,6 +16,7 @@ use upcr_lab::train::{Event, Trainer, TrainingConfig, Watcher, write_history};
 use crate::Status;
 use crate::output;
 use crate::pairs::Pairs;
+use crate::stream::{Stream, Streaming};
 
 const AFTER_HELP: &str = "\
 Files in the run's folder:
@@ -67,6 +68,8 @@ pub struct Args {
     /// Go on with the run in this folder, as it was started
     #[arg(long, value_name = "RUN", conflicts_with_all = ["data", "protocol", "partial", "preset", "config", "network", "changes", "seed", "out"])]
     resume: Option<PathBuf>,
+    #[command(flatten)]
+    stream: Streaming,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -112,6 +115,7 @@ pub fn run(args: &Args) -> Result<Status> {
 }
 
 fn train(args: &Args) -> Result<Status> {
+    let stream = args.stream.open("train")?;
     let device = args.backend.device();
     let (folder, run, mut trainer) = match &args.resume {
         Some(folder) => {
@@ -133,8 +137,10 @@ fn train(args: &Args) -> Result<Status> {
     }
     output::note(&format!("{} shapes to learn from", shapes.len()));
     let mixture = run.protocol.mixture(run.partial);
-    let done = trainer.run(&shapes, &mixture, &mut Teller::new()?)?;
+    let mut teller = Teller::new(stream)?;
+    let done = trainer.run(&shapes, &mixture, &mut teller)?;
     write_history(&folder, trainer.history())?;
+    teller.close()?;
     if !done {
         output::note(&format!("stopped; go on with: upcr train --resume {}", folder.display()));
         return Ok(Status::Stopped);
@@ -183,13 +189,14 @@ fn start(args: &Args, device: &upcr_lab::Device) -> Result<(PathBuf, Run, Traine
     Ok((folder, run, trainer))
 }
 
-/// Tells of the run's progress on stderr, and of the user's wish to stop.
+/// Tells of the run's progress on stderr and as curves over `step`, and of the user's wish to stop.
 pub struct Teller {
     stopped: Arc<AtomicBool>,
+    stream: Option<Stream>,
 }
 
 impl Teller {
-    pub fn new() -> Result<Self> {
+    pub fn new(stream: Option<Stream>) -> Result<Self> {
         let stopped = Arc::new(AtomicBool::new(false));
         let flag = stopped.clone();
         // A second interruption ends the process at once.
@@ -198,7 +205,11 @@ impl Teller {
                 std::process::exit(130);
             }
         })?;
-        Ok(Self { stopped })
+        Ok(Self { stopped, stream })
+    }
+
+    pub fn close(self) -> Result<()> {
+        self.stream.map_or(Ok(()), Stream::close)
     }
 }
 
@@ -222,6 +233,17 @@ impl Watcher for Teller {
             e.clouds_per_second,
             duration(e.time_left(clouds_left)),
         ));
+        let Some(stream) = &self.stream else { return };
+        stream.at("step", e.step);
+        stream.number("loss/learned", e.loss);
+        stream.number("learning_rate", e.learning_rate);
+        stream.number("clouds_per_second", e.clouds_per_second);
+        if let Some(v) = e.validation {
+            stream.number("loss/held_out", v.loss);
+            stream.number("held_out/mae_r_deg", v.mae_r_deg);
+            stream.number("held_out/mae_t", v.mae_t);
+            stream.number("held_out/recall", v.recall);
+        }
     }
 
     fn stop(&mut self) -> bool {

@@ -4,12 +4,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
 use anyhow::{Context, Result, bail};
-use upcr::PointCloud;
-use upcr::io;
+use upcr::{PointCloud, Rigid, io};
 use upcr_lab::files::write_atomically;
 use upcr_report::Page;
 
 use crate::output::{self, Progress};
+use crate::stream::{Stream, Streaming};
 use crate::{Status, input};
 
 /// Show clouds in 3-D: writes one HTML page, which needs no network, and opens it in the browser
@@ -22,11 +22,13 @@ pub struct Args {
     #[arg(long, value_name = "FILE")]
     pose: Option<PathBuf>,
     /// Where to write the page [default: a file in the folder for temporary ones]
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", conflicts_with = "rerun")]
     out: Option<PathBuf>,
     /// Write the page, and open nothing
-    #[arg(long)]
+    #[arg(long, conflicts_with = "rerun")]
     no_open: bool,
+    #[command(flatten)]
+    stream: Streaming,
     #[command(flatten)]
     reading: input::Reading,
 }
@@ -36,6 +38,7 @@ pub fn run(args: &Args) -> Result<Status> {
         output::check_folder(path)?;
     }
     let pose = args.pose.as_deref().map(io::read_transform).transpose()?;
+    let stream = args.stream.open("view")?;
     let mut progress = Progress::new();
     let mut clouds: Vec<(String, PointCloud)> = Vec::new();
     let mut comments = Vec::new();
@@ -47,6 +50,10 @@ pub fn run(args: &Args) -> Result<Status> {
         }
         clouds.push((path.display().to_string(), cloud));
         comments.push(io::read_comments(path)?);
+    }
+    if let Some(stream) = stream {
+        show(stream, &clouds, pose.as_ref())?;
+        return Ok(Status::Done);
     }
     progress.step("writing");
     let named: Vec<_> = clouds.iter().map(|(name, cloud)| (name.as_str(), cloud)).collect();
@@ -67,6 +74,20 @@ pub fn run(args: &Args) -> Result<Status> {
         output::note("warning: no browser could be started: open the page by hand, or say --no-open");
     }
     Ok(Status::Done)
+}
+
+/// Streams the clouds in place of a page.
+fn show(mut stream: Stream, clouds: &[(String, PointCloud)], pose: Option<&Rigid>) -> Result<()> {
+    let [(moved, source), others @ ..] = clouds else { return stream.close() };
+    let mut others: Vec<_> =
+        others.iter().enumerate().map(|(i, (name, cloud))| (name, cloud, i + 1)).collect();
+    // The one that moves comes last, so that the picture's origin is near what stays.
+    others.push((moved, source, 0));
+    for (name, cloud, color) in others {
+        stream.cloud(name, cloud, color);
+        stream.pose(name, pose.filter(|_| color == 0).unwrap_or(&Rigid::identity()));
+    }
+    stream.close()
 }
 
 /// A page of one's own in a folder that only its maker can write to.

@@ -118,7 +118,8 @@ pub fn register<'py>(
         let found = || {
             let (source, target) = (source.seen_from(viewpoints[0])?, target.seen_from(viewpoints[1])?);
             let (cancelled, hear) = (|| caller.is_gone(), |progress| caller.tell(progress));
-            let watch = Watch { cancelled: Some(&cancelled), progress: told.then_some(&hear) };
+            let watch =
+                Watch { cancelled: Some(&cancelled), progress: told.then_some(&hear), ..Watch::default() };
             let registration = register_watched(&source, &target, &settings, &watch)?;
             Ok(Found::new(registration, &source, &target))
         };
@@ -147,7 +148,7 @@ impl Pair {
         let told = settings.threads;
         let settings = Settings { init: self.init.or(settings.init), threads: None, ..settings.clone() };
         let (source, target) = (self.source.get()?, self.target.get()?);
-        let watch = Watch { cancelled: Some(gone), progress: None };
+        let watch = Watch { cancelled: Some(gone), ..Watch::default() };
         let mut registration = register_watched(&source, &target, &settings, &watch)?;
         registration.settings.threads = told;
         Ok(Found::new(registration, &source, &target))

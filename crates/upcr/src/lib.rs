@@ -28,7 +28,7 @@ pub use registration::{Alternative, Reason, Registration, TRUSTWORTHY, Timings};
 pub use settings::{Method, Settings};
 pub use transform::Rigid;
 pub use verify::{Calibration, Evidence, FEATURES, Weights};
-pub use watch::{Progress, Stage, Watch};
+pub use watch::{PoseStep, Progress, Stage, StepPairs, Watch};
 
 #[cfg(doctest)]
 #[doc = include_str!("../../../README.md")]

@@ -7,7 +7,7 @@ use std::time::Duration;
 use serde::Serialize;
 use web_time::Instant;
 
-use crate::{Error, registration::Reason, settings::Method};
+use crate::{Error, registration::Reason, settings::Method, transform::Rigid};
 
 /// A step of a registration.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
@@ -48,6 +48,34 @@ pub struct Progress {
     pub done: f64,
 }
 
+/// A pose that the refinement goes through.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct PoseStep {
+    /// The source of hypotheses that proposed the one which is refined.
+    pub method: Method,
+    /// The number of that hypothesis, among all that the call refines to the end, from 0.
+    pub hypothesis: usize,
+    /// Iterations since the hypothesis: 0 is the hypothesis itself.
+    pub iteration: usize,
+    /// Whether it comes of the fine refinement, whose iterations [`Registration::iterations`](crate::Registration) counts.
+    pub fine: bool,
+    /// Takes source coordinates to target coordinates, in the clouds' own frames.
+    pub T_target_source: Rigid,
+    /// The pairs of points that the iteration laid on each other; none for the hypothesis itself.
+    pub pairs: Option<StepPairs>,
+}
+
+/// What an iteration of the refinement worked on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct StepPairs {
+    /// Share of the points it moved that have a partner within reach. The reach shrinks from iteration to iteration.
+    pub share: f64,
+    /// Root of the mean square distance of these pairs at the new pose, in the clouds' unit.
+    pub rmse: f64,
+}
+
 /// How a registration is watched from outside; the default is not at all.
 #[derive(Clone, Copy, Default)]
 pub struct Watch<'a> {
@@ -57,6 +85,9 @@ pub struct Watch<'a> {
     /// Hears how far the call is: some tens of times, never twice at once, in order, on whatever thread the call runs.
     /// The call waits meanwhile.
     pub progress: Option<&'a (dyn Fn(Progress) + Sync)>,
+    /// Hears each pose that the refinement goes through, of each hypothesis that is refined to the end, one hypothesis after
+    /// the other; otherwise as `progress`.
+    pub poses: Option<&'a (dyn Fn(PoseStep) + Sync)>,
 }
 
 impl std::fmt::Debug for Watch<'_> {
@@ -64,6 +95,7 @@ impl std::fmt::Debug for Watch<'_> {
         f.debug_struct("Watch")
             .field("cancelled", &self.cancelled.is_some())
             .field("progress", &self.progress.is_some())
+            .field("poses", &self.poses.is_some())
             .finish()
     }
 }
@@ -127,7 +159,7 @@ impl<'a> Call<'a> {
 
     /// For a question beside the work, which has the same limits and tells nothing.
     pub fn aside(&self) -> Call<'a> {
-        let watch = Watch { progress: None, ..self.watch };
+        let watch = Watch { progress: None, poses: None, ..self.watch };
         Self { deadline: self.deadline, ..Self::new(None, watch) }
     }
 
@@ -175,6 +207,18 @@ impl<'a> Call<'a> {
         self.tell(|step| Step { done: step.done.max(step.from + share * (step.to - step.from)), ..step });
     }
 
+    /// Whether someone hears the poses.
+    pub fn tells_poses(&self) -> bool {
+        self.watch.poses.is_some()
+    }
+
+    /// Tells a pose that the refinement goes through.
+    pub fn tell_pose(&self, step: PoseStep) {
+        if let Some(poses) = self.watch.poses {
+            poses(step);
+        }
+    }
+
     /// Tells that the call has an answer.
     pub fn end(&self) {
         self.tell(|step| Step { done: 1.0, ..step });
@@ -200,7 +244,7 @@ mod tests {
     fn what_ends_a_call_first_has_ended_it() {
         let asked = AtomicUsize::new(0);
         let third = || asked.fetch_add(1, Ordering::Relaxed) == 2;
-        let call = Call::new(Some(1e300), Watch { cancelled: Some(&third), progress: None });
+        let call = Call::new(Some(1e300), Watch { cancelled: Some(&third), ..Watch::default() });
         assert!(!call.is_over() && !call.is_over() && call.ended_by().is_none());
         assert!(call.is_over() && call.is_over());
         assert_eq!((call.ended_by(), asked.load(Ordering::Relaxed)), (Some(Reason::Cancelled), 3));
@@ -216,7 +260,7 @@ mod tests {
     fn progress_never_falls() {
         let told = Mutex::new(Vec::new());
         let hear = |p: Progress| told.lock().unwrap().push((p.stage, p.done));
-        let call = Call::new(None, Watch { cancelled: None, progress: Some(&hear) });
+        let call = Call::new(None, Watch { progress: Some(&hear), ..Watch::default() });
         call.begin(Stage::Prepare, None, (0.0, 0.5));
         call.advance(0.5);
         call.begin(Stage::Refine, None, (0.2, 0.4));

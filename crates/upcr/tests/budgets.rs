@@ -60,7 +60,7 @@ fn budgets_that_are_not_reached_change_nothing() {
         assert_eq!(plain.points_used, [pair.source.len(), pair.target.len()]);
         let ample =
             Settings { max_seconds: Some(1e300), max_memory_bytes: Some(1 << 32), ..settings.clone() };
-        let watch = Watch { cancelled: Some(&|| false), progress: Some(&|_| ()) };
+        let watch = Watch { cancelled: Some(&|| false), progress: Some(&|_| ()), poses: Some(&|_| ()) };
         let watched = register_watched(&pair.source, &pair.target, &ample, &watch).unwrap();
         assert_eq!(answer(&watched), answer(&plain), "{method:?}");
     }
@@ -108,7 +108,7 @@ fn cancelling_from_another_thread_ends_the_call() {
     let full = start.elapsed();
     let cancelled = AtomicBool::new(false);
     let ask = || cancelled.load(Ordering::Relaxed);
-    let watch = Watch { cancelled: Some(&ask), progress: None };
+    let watch = Watch { cancelled: Some(&ask), ..Watch::default() };
     let start = Instant::now();
     let found = std::thread::scope(|scope| {
         scope.spawn(|| {
@@ -132,7 +132,7 @@ fn wherever_it_ends_the_best_pose_so_far_comes_back() {
         let run = |last: usize| {
             let asked = AtomicUsize::new(0);
             let cancelled = || asked.fetch_add(1, Ordering::Relaxed) + 1 >= last;
-            let watch = Watch { cancelled: Some(&cancelled), progress: None };
+            let watch = Watch { cancelled: Some(&cancelled), ..Watch::default() };
             let found = register_watched(&pair.source, &pair.target, &settings, &watch).unwrap();
             (found, asked.load(Ordering::Relaxed))
         };
@@ -174,7 +174,7 @@ fn a_pose_that_was_not_compared_is_not_trusted() {
         cancelled.store(refining.load(Ordering::Relaxed) == 2, Ordering::Relaxed);
     };
     let ask = || cancelled.load(Ordering::Relaxed);
-    let watch = Watch { cancelled: Some(&ask), progress: Some(&hear) };
+    let watch = Watch { cancelled: Some(&ask), progress: Some(&hear), ..Watch::default() };
     let found = register_watched(&pair.source, &pair.target, &settings, &watch).unwrap();
     assert!(found.reasons.contains(&Reason::Cancelled) && found.num_inliers > 0, "{found:?}");
     assert!(pair.error(&found.T_target_source).within(5.0, 0.05));
@@ -192,7 +192,7 @@ fn progress_goes_from_nothing_to_all() {
     ] {
         let told: Mutex<Vec<Progress>> = Mutex::default();
         let hear = |p| told.try_lock().expect("never twice at once").push(p);
-        let watch = Watch { cancelled: None, progress: Some(&hear) };
+        let watch = Watch { progress: Some(&hear), ..Watch::default() };
         let settings = Settings { threads: NonZeroUsize::new(1), ..Settings::default() };
         register_watched(&pair.source, &pair.target, &settings, &watch).unwrap();
         let told = told.into_inner().unwrap();
@@ -214,7 +214,7 @@ fn a_call_that_ends_early_tells_so_too() {
     let (pair, settings) = sample(Method::Auto);
     let told: Mutex<Vec<Progress>> = Mutex::default();
     let hear = |p| told.lock().unwrap().push(p);
-    let watch = Watch { cancelled: Some(&|| true), progress: Some(&hear) };
+    let watch = Watch { cancelled: Some(&|| true), progress: Some(&hear), ..Watch::default() };
     register_watched(&pair.source, &pair.target, &settings, &watch).unwrap();
     let told = told.into_inner().unwrap();
     assert_eq!(told.last().map(|p| (p.stage, p.done)), Some((Stage::Prepare, 1.0)));

@@ -8,7 +8,7 @@ use std::time::Duration;
 use super::{Scratch, command, upcr};
 
 /// Settings of a run of seconds.
-const SETTINGS: &str = "\
+pub(super) const SETTINGS: &str = "\
 seed = 3
 checkpoint_seconds = 0.0
 validation_every_nth = 5

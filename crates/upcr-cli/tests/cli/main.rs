@@ -9,6 +9,7 @@ mod commands;
 #[cfg(feature = "train")]
 mod learning;
 mod register;
+mod rerun;
 
 use std::ffi::OsStr;
 use std::fmt::Write;

@@ -7,7 +7,11 @@ use super::{
     Factor, LockedPose, RobustKernel,
     solver::{Correspondence, MIN_DAMPING, Objective},
 };
-use crate::{prepare::Level, transform::Rigid, watch::Call};
+use crate::{
+    prepare::Level,
+    transform::Rigid,
+    watch::{Call, StepPairs},
+};
 
 /// Source points are matched in blocks of this many; the blocks' results stand in order.
 const BLOCK: usize = 256;
@@ -72,6 +76,9 @@ pub(crate) struct Refined {
     pub converged: bool,
 }
 
+/// Hears of each iteration's pose, in local frames, and pairs.
+pub(crate) type Hear<'a> = &'a mut dyn FnMut(&Rigid, StepPairs);
+
 /// Iterative closest points between two clouds.
 pub(crate) struct Icp<'a> {
     pub source: &'a Level,
@@ -83,8 +90,14 @@ pub(crate) struct Icp<'a> {
 }
 
 impl<'a> Icp<'a> {
-    /// Refines `pose` by moving the points `moved` of the source onto the target.
-    pub fn refine(&self, moved: &[u32], pose: &Rigid, schedule: &Schedule) -> Refined {
+    /// Refines `pose` by moving the points `moved` of the source onto the target. `hear` hears of every iteration counted.
+    pub fn refine(
+        &self,
+        moved: &[u32],
+        pose: &Rigid,
+        schedule: &Schedule,
+        mut hear: Option<Hear>,
+    ) -> Refined {
         let mut refined =
             Refined { pose: self.lock.map_or(*pose, |l| l.project(pose)), iterations: 0, converged: false };
         let (first, last) = schedule.max_distance;
@@ -105,7 +118,13 @@ impl<'a> Icp<'a> {
             }
             let objective = self.objective(&pairs, &refined.pose, max_distance);
             refined.iterations = iteration + 1;
-            let Some(next) = objective.step(&refined.pose, &pairs, self.lock, &mut damping) else {
+            let next = objective.step(&refined.pose, &pairs, self.lock, &mut damping);
+            if let Some(hear) = &mut hear {
+                let pose = next.as_ref().unwrap_or(&refined.pose);
+                let share = pairs.len() as f64 / moved.len() as f64;
+                hear(pose, StepPairs { share, rmse: rmse(&pairs, pose) });
+            }
+            let Some(next) = next else {
                 refined.converged = along >= 1.0;
                 if refined.converged {
                     break;
@@ -216,11 +235,17 @@ fn keep_closest(pairs: &mut Vec<Correspondence>, pose: &Rigid, keep: f64) {
     if kept == 0 || kept >= pairs.len() {
         return;
     }
-    let distance_sq = |c: &Correspondence| {
-        (pose.rotation * Vector3::from(c.source.map(f64::from)) + pose.translation
-            - Vector3::from(c.target.map(f64::from)))
-        .norm_squared()
-    };
-    pairs.select_nth_unstable_by(kept - 1, |a, b| distance_sq(a).total_cmp(&distance_sq(b)));
+    pairs.select_nth_unstable_by(kept - 1, |a, b| distance_sq(a, pose).total_cmp(&distance_sq(b, pose)));
     pairs.truncate(kept);
+}
+
+fn rmse(pairs: &[Correspondence], pose: &Rigid) -> f64 {
+    let sum: f64 = pairs.iter().map(|c| distance_sq(c, pose)).sum();
+    (sum / pairs.len() as f64).sqrt()
+}
+
+fn distance_sq(c: &Correspondence, pose: &Rigid) -> f64 {
+    (pose.rotation * Vector3::from(c.source.map(f64::from)) + pose.translation
+        - Vector3::from(c.target.map(f64::from)))
+    .norm_squared()
 }

@@ -12,7 +12,7 @@ mod point;
 mod robust;
 mod solver;
 
-pub(crate) use icp::{Icp, Refined, Schedule};
+pub(crate) use icp::{Hear, Icp, Refined, Schedule};
 pub(crate) use information::{Information, Patch};
 pub(crate) use lock::LockedPose;
 pub use lock::Locks;

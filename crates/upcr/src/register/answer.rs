@@ -121,7 +121,7 @@ impl Pipeline<'_> {
     }
 
     /// The pose between the clouds in their files' frames.
-    fn file_pose(&self, local: &Rigid) -> Rigid {
+    pub(super) fn file_pose(&self, local: &Rigid) -> Rigid {
         match &self.lock {
             Some(lock) => lock.file_pose(local),
             None => to_file(local, self.source, self.target),

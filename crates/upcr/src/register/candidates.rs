@@ -6,10 +6,11 @@ use super::Pipeline;
 use crate::{
     hypothesis::{Hypothesis, separation, turned},
     prepare::{Level, Prepared},
-    refine::{Refined, Refinement, Schedule},
+    refine::{Hear, Icp, Refined, Refinement, Schedule},
     settings::Method,
     transform::Rigid,
     verify::{Seen, in_free_space, overlap_at},
+    watch::{PoseStep, StepPairs},
 };
 
 /// Hypotheses that are refined on the coarse level, and of those on the fine one.
@@ -54,6 +55,14 @@ pub(super) struct Glimpse {
     pub proposed: bool,
 }
 
+/// A hypothesis with its score.
+struct Ranked {
+    score: f64,
+    hypothesis: Hypothesis,
+    /// The poses that it went through, from the one proposed on; empty where nobody hears them.
+    way: Vec<(Rigid, Option<StepPairs>)>,
+}
+
 /// A refined pose with its score.
 pub(super) struct Candidate {
     pub method: Method,
@@ -81,28 +90,39 @@ impl Pipeline<'_> {
             ranked
         };
         let moved = source.spread(COARSE_POINTS);
-        let coarsely_refined = |ranked: Vec<(f64, Hypothesis)>| {
+        let listened = self.call.tells_poses();
+        let coarsely_refined = |ranked: Vec<(f64, Hypothesis)>| -> Vec<Ranked> {
+            let mut ranked: Vec<Ranked> = ranked
+                .into_iter()
+                .map(|(score, hypothesis)| {
+                    let way = if listened { vec![(hypothesis.pose, None)] } else { Vec::new() };
+                    Ranked { score, hypothesis, way }
+                })
+                .collect();
             if self.settings.refine == Refinement::None || ranked.is_empty() || self.call.is_over() {
                 return ranked;
             }
             let icp = self.icp(source, target);
-            let refined = ranked.par_iter().map(|(_, h)| {
-                let pose = icp.refine(&moved, &h.pose, &Schedule::coarse(limit)).pose;
-                (rank(&pose, COMPARING_POINTS) * self.clearance(&pose), Hypothesis { pose, ..*h })
+            ranked.par_iter_mut().for_each(|Ranked { score, hypothesis, way }| {
+                let mut hear = |pose: &Rigid, pairs| way.push((*pose, Some(pairs)));
+                let hear: Option<Hear> = if listened { Some(&mut hear) } else { None };
+                let pose = icp.refine(&moved, &hypothesis.pose, &Schedule::coarse(limit), hear).pose;
+                *score = rank(&pose, COMPARING_POINTS) * self.clearance(&pose);
+                hypothesis.pose = pose;
             });
-            refined.collect()
+            ranked
         };
         // The best come first.
         let few = hypotheses.len().min(COARSE_CANDIDATES);
         let hypotheses =
             if hypotheses.len() > few && self.call.is_over() { &hypotheses[..few] } else { hypotheses };
         let mut ranked = coarsely_refined(promising(hypotheses, RANKING_POINTS, PROMISING, 0.0));
-        ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let glimpsed = |ranked: &[(f64, Hypothesis)], proposed| -> Vec<Glimpse> {
-            ranked.iter().map(|&(score, h)| Glimpse { score, pose: h.pose, proposed }).collect()
+        ranked.sort_by(|a, b| b.score.total_cmp(&a.score));
+        let glimpsed = |ranked: &[Ranked], proposed| -> Vec<Glimpse> {
+            ranked.iter().map(|r| Glimpse { score: r.score, pose: r.hypothesis.pose, proposed }).collect()
         };
         let mut glimpses = glimpsed(&ranked, true);
-        if let Some((score, best)) = ranked.first()
+        if let Some(Ranked { score, hypothesis: best, .. }) = ranked.first()
             && *score < COINCIDENT
             && !self.call.is_over()
         {
@@ -112,26 +132,25 @@ impl Pipeline<'_> {
             let others = coarsely_refined(others);
             glimpses.extend(glimpsed(&others, false));
             ranked.extend(others);
-            ranked.sort_by(|a, b| b.0.total_cmp(&a.0));
+            ranked.sort_by(|a, b| b.score.total_cmp(&a.score));
         }
-        let mut distinct: Vec<(f64, Hypothesis)> = Vec::new();
-        for (score, h) in ranked {
-            if distinct.iter().all(|(_, d)| !self.coarsely_same(&d.pose, &h.pose)) {
-                distinct.push((score, h));
+        let mut distinct: Vec<Ranked> = Vec::new();
+        for r in ranked {
+            if distinct.iter().all(|d| !self.coarsely_same(&d.hypothesis.pose, &r.hypothesis.pose)) {
+                distinct.push(r);
             }
         }
-        let best = distinct.first().map_or(0.0, |best| best.0);
+        let best = distinct.first().map_or(0.0, |best| best.score);
         let worth_it = |rank: usize, score: f64| {
             let enough = if rank < FINE_CANDIDATES { PROMISING } else { RIVALLING };
             rank < RIVALS && score >= enough * best
         };
-        let count =
-            distinct.iter().enumerate().take_while(|(rank, (score, _))| worth_it(*rank, *score)).count();
+        let count = distinct.iter().enumerate().take_while(|(rank, r)| worth_it(*rank, r.score)).count();
         let going_on = |&(rank, _): &(usize, _)| rank == 0 || !self.call.is_over();
         let fine = distinct[..count].iter().enumerate().take_while(going_on);
-        let candidates = fine.map(|(rank, (_, h))| {
+        let candidates = fine.map(|(rank, ranked)| {
             self.call.advance(rank as f64 / count as f64);
-            self.finely_refined(h)
+            self.finely_refined(ranked, self.candidates.len() + rank)
         });
         (candidates.collect(), glimpses)
     }
@@ -146,7 +165,30 @@ impl Pipeline<'_> {
         separation(a, b, f64::from(self.source.fine.radius)) <= f64::from(self.coarse_reach())
     }
 
-    fn finely_refined(&self, hypothesis: &Hypothesis) -> Candidate {
+    fn finely_refined(&self, ranked: &Ranked, number: usize) -> Candidate {
+        let Ranked { hypothesis, way, .. } = ranked;
+        let tell = |iteration, fine, pose: &Rigid, pairs| {
+            self.call.tell_pose(PoseStep {
+                method: hypothesis.method,
+                hypothesis: number,
+                iteration,
+                fine,
+                T_target_source: self.file_pose(pose),
+                pairs,
+            });
+        };
+        for (iteration, (pose, pairs)) in way.iter().enumerate() {
+            tell(iteration, false, pose, *pairs);
+        }
+        let mut iteration = way.len();
+        let mut hear = |pose: &Rigid, pairs| {
+            tell(iteration, true, pose, Some(pairs));
+            iteration += 1;
+        };
+        let mut refine = |icp: &Icp, moved: &[u32], pose: &Rigid, schedule: &Schedule| {
+            let hear: Option<Hear> = if self.call.tells_poses() { Some(&mut hear) } else { None };
+            icp.refine(moved, pose, schedule, hear)
+        };
         let (source, target) = (&self.source.fine, &self.target.fine);
         let reach = REACH_VOXELS * self.voxel_size as f32;
         let icp = self.icp(source, target);
@@ -154,20 +196,17 @@ impl Pipeline<'_> {
         let few = Level::thin(&moved, FEW_POINTS);
         let keep = self.settings.overlap.unwrap_or(1.0);
         let refined = if self.settings.refine == Refinement::None {
-            icp.refine(
-                &few,
-                &hypothesis.pose,
-                &Schedule { max_iterations: 0, ..Schedule::settled(reach, keep) },
-            )
+            let none = Schedule { max_iterations: 0, ..Schedule::settled(reach, keep) };
+            refine(&icp, &few, &hypothesis.pose, &none)
         } else {
             // A guess may be further off than what the coarse level brings near.
             let first = if hypothesis.method == Method::Prior { 3.0 * reach } else { 1.5 * reach };
-            let found = icp.refine(&few, &hypothesis.pose, &Schedule::fine(first, reach, keep));
+            let found = refine(&icp, &few, &hypothesis.pose, &Schedule::fine(first, reach, keep));
             if few.len() == moved.len() || self.call.is_over() {
                 found
             } else {
                 let all = Level::thin(&moved, FINE_POINTS);
-                let settled = icp.refine(&all, &found.pose, &Schedule::settled(reach, keep));
+                let settled = refine(&icp, &all, &found.pose, &Schedule::settled(reach, keep));
                 Refined {
                     iterations: found.iterations + settled.iterations,
                     converged: found.converged || settled.converged,

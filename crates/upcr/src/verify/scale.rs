@@ -264,7 +264,7 @@ mod tests {
     fn what_ends_the_question_ends_the_call() {
         let ended = AtomicBool::new(false);
         let cancelled = || ended.load(Ordering::Relaxed);
-        let call = Call::new(None, Watch { cancelled: Some(&cancelled), progress: None });
+        let call = Call::new(None, Watch { cancelled: Some(&cancelled), ..Watch::default() });
         let sheet = sheet(1.0);
         let found =
             of_wholes(1.7).fitting_factor(&sheet, &sheet, &Settings::default(), &call, |_, _, _, aside| {
