@@ -16,7 +16,7 @@ use crate::Status;
 use crate::output;
 use crate::pairs::Pairs;
 use crate::stream::Streaming;
-use crate::train::{Backend, Teller};
+use crate::train::{Backend, LEARNING, Teller};
 
 const AFTER_HELP: &str = "\
 Files in the output folder:
@@ -98,7 +98,7 @@ pub fn run(args: &Args) -> Result<Status> {
 }
 
 fn learn(args: &Args) -> Result<Status> {
-    let stream = args.stream.open("adapt")?;
+    let stream = args.stream.open("adapt", &LEARNING)?;
     let (path, bytes) = match &args.weights {
         Some(path) => (path.as_path(), std::fs::read(path).with_context(|| path.display().to_string())?),
         None => (Path::new("the weights inside"), EMBEDDED_WEIGHTS.to_vec()),

@@ -22,7 +22,7 @@ use upcr_lab::files::write_atomically;
 use upcr_report::Page;
 
 use crate::output::{self, Progress};
-use crate::stream::{Stream, Streaming};
+use crate::stream::{Layout, Stream, Streaming};
 use crate::{Status, describe, input};
 
 /// Find the pose that lays SOURCE on TARGET
@@ -189,7 +189,9 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status
     if let Some(path) = &args.output {
         io::check_writable(path)?;
     }
-    let stream = args.stream.open(&format!("{} -> {}", source_path.display(), target_path.display()))?;
+    let name = format!("{} -> {}", source_path.display(), target_path.display());
+    let layout = Layout { clouds: true, curves: &["rmse", "paired"], words: true };
+    let stream = args.stream.open(&name, &layout)?;
     let mut progress = Progress::new();
     progress.step("reading");
     let source = args.reading.read(source_path)?;

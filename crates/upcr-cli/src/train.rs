@@ -16,7 +16,7 @@ use upcr_lab::train::{Event, Trainer, TrainingConfig, Watcher, write_history};
 use crate::Status;
 use crate::output;
 use crate::pairs::Pairs;
-use crate::stream::{Stream, Streaming};
+use crate::stream::{Layout, Stream, Streaming};
 
 const AFTER_HELP: &str = "\
 Files in the run's folder:
@@ -25,6 +25,13 @@ Files in the run's folder:
   weights.safetensors      the learned weights, at the end
   history.csv              the learning curve
   history.svg              the same as a plot";
+
+/// What a viewer shows of learning, as [`Teller`] streams it.
+pub const LEARNING: Layout = Layout {
+    clouds: false,
+    curves: &["loss", "learning_rate", "rotation", "translation", "recall", "pace"],
+    words: false,
+};
 
 /// Learn a network from shapes; UPCR without labels
 #[derive(clap::Args)]
@@ -115,7 +122,7 @@ pub fn run(args: &Args) -> Result<Status> {
 }
 
 fn train(args: &Args) -> Result<Status> {
-    let stream = args.stream.open("train")?;
+    let stream = args.stream.open("train", &LEARNING)?;
     let device = args.backend.device();
     let (folder, run, mut trainer) = match &args.resume {
         Some(folder) => {
@@ -236,13 +243,13 @@ impl Watcher for Teller {
         let Some(stream) = &self.stream else { return };
         stream.at("step", e.step);
         stream.number("loss/learned", e.loss);
-        stream.number("learning_rate", e.learning_rate);
-        stream.number("clouds_per_second", e.clouds_per_second);
+        stream.number("learning_rate/adam", e.learning_rate);
+        stream.number("pace/clouds_per_second", e.clouds_per_second);
         if let Some(v) = e.validation {
             stream.number("loss/held_out", v.loss);
-            stream.number("held_out/mae_r_deg", v.mae_r_deg);
-            stream.number("held_out/mae_t", v.mae_t);
-            stream.number("held_out/recall", v.recall);
+            stream.number("rotation/held_out_mae_deg", v.mae_r_deg);
+            stream.number("translation/held_out_mae", v.mae_t);
+            stream.number("recall/held_out", v.recall);
         }
     }
 

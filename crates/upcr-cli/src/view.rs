@@ -9,7 +9,7 @@ use upcr_lab::files::write_atomically;
 use upcr_report::Page;
 
 use crate::output::{self, Progress};
-use crate::stream::{Stream, Streaming};
+use crate::stream::{Layout, Stream, Streaming};
 use crate::{Status, input};
 
 /// Show clouds in 3-D: writes one HTML page, which needs no network, and opens it in the browser
@@ -38,7 +38,7 @@ pub fn run(args: &Args) -> Result<Status> {
         output::check_folder(path)?;
     }
     let pose = args.pose.as_deref().map(io::read_transform).transpose()?;
-    let stream = args.stream.open("view")?;
+    let stream = args.stream.open("view", &Layout { clouds: true, curves: &[], words: false })?;
     let mut progress = Progress::new();
     let mut clouds: Vec<(String, PointCloud)> = Vec::new();
     let mut comments = Vec::new();

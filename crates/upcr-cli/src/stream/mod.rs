@@ -37,21 +37,31 @@ pub struct Streaming {
 }
 
 impl Streaming {
-    /// Begins the stream, where one is asked for. `name` tells recordings apart in the viewer.
+    /// Begins the stream, where one is asked for. `name` tells recordings apart in the viewer, which shows `layout` at first.
     ///
     /// # Errors
     /// Where no viewer answers, or the file cannot come to its place.
     #[cfg(feature = "rerun")]
-    pub fn open(&self, name: &str) -> Result<Option<Stream>> {
+    pub fn open(&self, name: &str, layout: &Layout) -> Result<Option<Stream>> {
         use anyhow::Context;
-        self.rerun.as_ref().map(|to| Stream::open(to, name)).transpose().context("--rerun")
+        self.rerun.as_ref().map(|to| Stream::open(to, name, layout)).transpose().context("--rerun")
     }
 
     #[cfg(not(feature = "rerun"))]
     #[allow(clippy::unnecessary_wraps)]
-    pub fn open(&self, _: &str) -> Result<Option<Stream>> {
+    pub fn open(&self, _: &str, _: &Layout) -> Result<Option<Stream>> {
         Ok(self.rerun.map(|nowhere| match nowhere {}))
     }
+}
+
+/// What of a stream is shown side by side.
+#[cfg_attr(not(feature = "rerun"), allow(dead_code))]
+pub struct Layout {
+    pub clouds: bool,
+    /// Names that curves begin with, a diagram each.
+    pub curves: &'static [&'static str],
+    /// Whether words come with it, as documents or lines of the log.
+    pub words: bool,
 }
 
 /// Where a stream goes.

@@ -12,6 +12,10 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow, bail};
+use re_sdk::blueprint::{
+    Blueprint, ContainerLike, Grid, Horizontal, Spatial3DView, Tabs, TextDocumentView, TextLogView,
+    TimeSeriesView, Vertical,
+};
 use re_sdk::external::re_uri::ProxyUri;
 use re_sdk::sink::{GrpcSink, GrpcSinkConnectionState, MemorySinkStorage};
 use re_sdk::{EntityPath, RecordingStream, RecordingStreamBuilder, RecordingStreamResult, entity_path};
@@ -22,7 +26,7 @@ use upcr::{PointCloud, Rigid};
 use upcr_lab::files::write_atomically;
 use upcr_report::MOST_POINTS;
 
-use super::Where;
+use super::{Layout, Where};
 use crate::{describe, output};
 
 /// Colours of clouds that have none of their own, as in reports.
@@ -56,9 +60,10 @@ pub struct Stream {
 }
 
 impl Stream {
-    pub(super) fn open(to: &Where, name: &str) -> Result<Self> {
+    pub(super) fn open(to: &Where, name: &str, layout: &Layout) -> Result<Self> {
         // What is asked for on the command line is not for the environment to forbid.
         let builder = RecordingStreamBuilder::new("upcr").recording_name(name).enabled(true);
+        let builder = builder.with_default_blueprint(blueprint(layout));
         let (recording, file) = match to {
             Where::Here => (live(builder, &here()?)?, None),
             Where::Address(address) => (live(builder, address)?, None),
@@ -127,7 +132,7 @@ impl Stream {
         self.log(move |recording| recording.log(path, &transform));
     }
 
-    /// A point of a curve; `name` may have several parts, of which curves that share all but the last are drawn together.
+    /// A point of a curve, `DIAGRAM/CURVE`.
     pub fn number(&self, name: &str, value: f64) {
         let path = EntityPath::from(name);
         self.log(move |recording| recording.log(path, &Scalars::single(value)));
@@ -141,7 +146,9 @@ impl Stream {
 
     /// Words to read, for all steps.
     pub fn document(&self, name: &str, words: &str) {
-        let (path, document) = (EntityPath::from(name), TextDocument::new(words));
+        // Code, so that columns stay columns.
+        let (path, document) =
+            (EntityPath::from(name), TextDocument::from_markdown(format!("```\n{words}\n```")));
         self.log(move |recording| recording.log_static(path, &document));
     }
 
@@ -176,6 +183,29 @@ impl Stream {
         }
         Ok(())
     }
+}
+
+fn blueprint(layout: &Layout) -> Blueprint {
+    let mut beside: Vec<ContainerLike> = Vec::new();
+    for curves in layout.curves {
+        beside.push(TimeSeriesView::new(*curves).with_origin(*curves).into());
+    }
+    if layout.words {
+        let document = |name| TextDocumentView::new(name).with_origin(name).into();
+        let log = TextLogView::new("log").with_origin("log").into();
+        beside.push(Tabs::new([document("summary"), log, document("notes")]).into());
+    }
+    if !layout.clouds {
+        return Blueprint::new(Grid::new(beside));
+    }
+    let clouds = Spatial3DView::new("clouds").with_origin("clouds").into();
+    if beside.is_empty() {
+        return Blueprint::new(Tabs::new([
+            clouds,
+            TextDocumentView::new("notes").with_origin("notes").into(),
+        ]));
+    }
+    Blueprint::new(Horizontal::new([clouds, Vertical::new(beside).into()]).with_column_shares([2.0, 1.0]))
 }
 
 /// Logs what comes. A stream that is dropped and not closed leaves no file behind.
