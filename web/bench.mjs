@@ -33,7 +33,7 @@ for (let i = 0; i < RUNS; i += 1) {
     if (times === first) await page.locator("#file-1").setInputFiles(target);
     await page.locator("canvas").waitFor();
     times.push(await page.evaluate(() => Number(document.documentElement.dataset["ms"])));
-    await page.getByRole("button", { name: "New pair" }).click();
+    await page.getByRole("button", { name: "Files and settings" }).click();
   }
   await close();
 }

@@ -87,6 +87,7 @@ function busy(is: boolean): void {
   working.hidden = !is;
   go.disabled = is || !pair.both || !engine;
   sample.disabled = is;
+  pair.swap.disabled = is || !pair.both;
   for (const input of pair.element.querySelectorAll("input")) input.disabled = is;
 }
 
@@ -107,6 +108,8 @@ async function run(): Promise<void> {
     if (!(error instanceof Cancelled)) fail(error);
   }
   busy(false);
+  // The button that had the focus is gone.
+  if (!report) go.focus();
 }
 
 function show(words: string, blobs: ReadonlyMap<string, Uint8Array<ArrayBuffer>>): void {
@@ -115,14 +118,15 @@ function show(words: string, blobs: ReadonlyMap<string, Uint8Array<ArrayBuffer>>
   const contents = new Contents(words, (name) => blobs.get(name) ?? new Uint8Array());
   form.hidden = true;
   report = showReport(document.body, contents, {
-    toolbar: button("New pair", back, { title: "Back to the files" }),
+    toolbar: button("Files and settings", back, { title: "Back to what was registered, and how" }),
     beside: (chosen) => saving(held, contents.page, contents.page.clouds[0]?.name ?? "", chosen),
   });
   document.querySelector("canvas")?.focus();
 }
 
 function back(): void {
-  report?.dispose();
+  if (!report) return;
+  report.dispose();
   report = null;
   form.hidden = false;
   go.focus();
@@ -140,7 +144,12 @@ document.addEventListener("dragleave", (event) => over(event.relatedTarget !== n
 document.addEventListener("drop", (event) => {
   event.preventDefault();
   over(false);
-  if (working.hidden) pair.take([...(event.dataTransfer?.files ?? [])]);
+  const files = [...(event.dataTransfer?.files ?? [])];
+  if (!working.hidden || files.length === 0) return;
+  back();
+  failed.hidden = files.length <= 2;
+  failed.textContent = failed.hidden ? "" : `Two scans make a pair: ${files.length} are too many.`;
+  if (failed.hidden) pair.take(files);
 });
 
 async function load(): Promise<void> {
@@ -149,7 +158,9 @@ async function load(): Promise<void> {
   const { version, extensions } = await loading.start();
   loading.onProgress = (name, done) => {
     if (stage.textContent !== name) stage.textContent = name;
-    bar.value = done;
+    // How long drawing takes is not known.
+    if (name === "drawing") bar.removeAttribute("value");
+    else bar.value = done;
   };
   pair.accept(extensions);
   formats.textContent = `UPCR ${version}. Reads ${extensions.join(", ")}.`;

@@ -2,6 +2,7 @@
 
 import { button, count, el } from "@upcr/report/dom.ts";
 
+const EMPTY = "choose or drop a file";
 const ROLES = [["Source", "is moved"], ["Target", "stays"]] as const;
 
 function size(bytes: number): string {
@@ -28,7 +29,7 @@ export class Pair {
         input.value = "";
         if (file) this.#put(i, file);
       });
-      const name = el("span", { class: "name quiet" }, "choose or drop a file");
+      const name = el("span", { class: "name quiet" }, EMPTY);
       this.#inputs.push(input);
       this.#names.push(name);
       return el("label", { class: "slot", for: `file-${i}` }, input,
@@ -53,7 +54,7 @@ export class Pair {
     return source && target ? [source, target] : null;
   }
 
-  /** Puts files where there is room, two as source and target. */
+  /** Puts files where there is room, two as source and target; one beside two begins a new pair. */
   take(files: readonly File[]): void {
     const [first, second] = files;
     if (!first) return;
@@ -61,7 +62,8 @@ export class Pair {
       this.#show(0, first);
       this.#put(1, second);
     } else {
-      this.#put(this.#files[0] && !this.#files[1] ? 1 : 0, first);
+      if (this.both) this.#clear();
+      this.#put(this.#files[0] ? 1 : 0, first);
     }
   }
 
@@ -78,6 +80,12 @@ export class Pair {
     this.#files[index] = file;
     this.#names[index]?.replaceChildren(el("bdi", {}, file.name), ` ${size(file.size)}`);
     this.swap.disabled = !this.both;
+  }
+
+  #clear(): void {
+    this.#files.fill(null);
+    for (const name of this.#names) name.textContent = EMPTY;
+    this.swap.disabled = true;
   }
 
   #turn(): void {

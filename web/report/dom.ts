@@ -48,6 +48,17 @@ export function number(value: number | null): string {
   return Math.abs(value) < 1e-4 ? value.toExponential(3) : value.toLocaleString("en", { maximumSignificantDigits: 4 });
 }
 
+/** Text with its lines of numbers short enough to be read, column below column. */
+export function legible(text: string): string {
+  const lines = text.split("\n").map((line) => line.split(" "));
+  const isNumeric = (words: readonly string[]) => words.every((word) => word !== "" && Number.isFinite(Number(word)));
+  const short = lines.map((words) => isNumeric(words)
+    ? words.map((word) => Number(word).toFixed(Math.abs(Number(word)) < 1000 ? 6 : 3))
+    : words);
+  const width = Math.max(...short.filter((_, i) => isNumeric(lines[i] ?? [])).flat().map((word) => word.length));
+  return short.map((words, i) => (isNumeric(lines[i] ?? []) ? words.map((word) => word.padStart(width)) : words).join(" ")).join("\n");
+}
+
 export function count(value: number): string {
   return value.toLocaleString("en");
 }

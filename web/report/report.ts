@@ -1,9 +1,9 @@
 /** The report: a picture that can be turned, and all that is known about it beside. */
 
-import { type Coloring, type Palette, type Side, turnBetween, type Up, Viewer } from "@upcr/viewer";
+import { type Coloring, type Palette, type Side, turnBetween, type Up, UPS, Viewer } from "@upcr/viewer";
 
 import type { Contents, Pose } from "./contents.ts";
-import { button, choice, count, el, number, section } from "./dom.ts";
+import { button, choice, count, el, legible, number, section } from "./dom.ts";
 import { isDark, onTheme, turnTheme } from "./theme.ts";
 import { details, figures, verdict } from "./words.ts";
 
@@ -129,7 +129,7 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
 
   const size = el("input", { type: "range", min: 1, max: 8, step: 0.5, value: 2, id: "size" });
   size.addEventListener("input", () => viewer?.setSize(Number(size.value)));
-  const up = choice<Up>("Up", [["x", "x"], ["y", "y"], ["z", "z"]], "z", (value) => viewer?.setUp(value));
+  const up = choice<Up>("Up", UPS.map((axis) => [axis, axis.replace("-", "−")] as const), "z", (value) => viewer?.setUp(value));
 
   function theme(): void {
     const gradient = viewer?.setPalette(palette());
@@ -153,8 +153,8 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
 
   function showNotation(): void {
     const told = page.poses[chosen]?.notations[notation.selectedIndex];
-    poseText.textContent = told?.text ?? "";
-    poseAbout.textContent = told?.about ?? "";
+    poseText.textContent = legible(told?.text ?? "");
+    poseAbout.textContent = `${told?.about ?? ""} Copy gives all digits.`;
     copied.textContent = "";
   }
 
@@ -172,12 +172,13 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
   }
 
   async function copy(): Promise<void> {
-    const text = poseText.textContent ?? "";
+    const text = page.poses[chosen]?.notations[notation.selectedIndex]?.text ?? "";
     try {
       await navigator.clipboard.writeText(text);
       copied.textContent = "copied";
     } catch {
       // Some browsers give pages from files no clipboard: the text is selected, to be copied by hand.
+      poseText.textContent = text;
       getSelection()?.selectAllChildren(poseText);
       copied.textContent = "selected: copy it with Ctrl+C";
     }
@@ -214,7 +215,7 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
       const box = el("input", { type: "checkbox", checked: true });
       box.addEventListener("change", () => viewer?.setVisible(i, box.checked));
       const role = page.verdict || registered ? ["source", "target"][i] ?? "" : "";
-      const told = [role, `${count(cloud.points)} points`].filter((t) => t !== "").join(", ");
+      const told = [role, `${count(cloud.points)} ${cloud.points === 1 ? "point" : "points"}`].filter((t) => t !== "").join(", ");
       return el("li", {}, el("label", {}, box, el("span", { class: `swatch cloud-${i % 6}`, "aria-hidden": "true" }),
         el("span", { class: "name" }, el("bdi", {}, cloud.name)), el("span", { class: "quiet" }, told)),
         cloud.comments.length === 0 ? null : el("details", { class: "quiet", open: cloud.comments.length <= FEW },
@@ -298,13 +299,23 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
     "?": () => help.showModal(),
   };
 
+  let pointedAt: HTMLElement | null = null;
+  document.addEventListener("click", ({ detail, target: at }) => {
+    // Keys click too, without a count.
+    pointedAt = detail > 0 && at instanceof Element ? at.closest<HTMLElement>("button, summary") : null;
+  }, { signal: gone.signal });
   document.addEventListener("keydown", (event) => {
+    if (event.key === "Tab") pointedAt = null;
     if (event.ctrlKey || event.metaKey || event.altKey || help.open) return;
     const { target: at } = event;
     const element = at instanceof Element ? at : null;
     // What a focused control does with a key comes first.
     if (element?.matches("input, select, textarea")) return;
-    if (event.key === " " && element?.matches("button, summary")) return;
+    if (event.key === " " && element?.matches("button, summary")) {
+      if (element !== pointedAt) return;
+      // A button that was clicked has the focus too, and whoever clicked it does not mean it any more.
+      pointedAt.blur();
+    }
     if (/^Arrow|^Home$/.test(event.key) && element?.closest("aside, pre")) return;
     const digit = /^[0-9]$/.test(event.key) ? Number(event.key) : null;
     const act = digit === null ? keys[event.key] : () => choose(digit);

@@ -30,10 +30,15 @@ async function register(page, a, b) {
   await settle(page);
 }
 
-/** The pose that the page shows, as 16 numbers.
+/** The pose that the page copies, as 16 numbers; what it shows is that, rounded.
  *  @param {import("playwright-core").Page} page */
 async function pose(page) {
-  return ((await page.locator("pre").textContent()) ?? "").split(/\s+/).map(Number);
+  await page.locator("#copy").click();
+  await page.getByText("copied", { exact: true }).waitFor();
+  const numbers = (await page.evaluate(() => navigator.clipboard.readText())).split(/\s+/).map(Number);
+  const shown = ((await page.locator("pre").textContent()) ?? "").trim().split(/\s+/).map(Number);
+  assert.ok(farthest(shown, numbers) <= 5.1e-7);
+  return numbers;
 }
 
 /** The same of the command line.
@@ -128,7 +133,7 @@ test("goes by the settings, and swaps", async () => {
   assert.ok(farthest(found, told(source, target, ...options)) < 1e-4);
   assert.ok(farthest(found, told(source, target)) > 1e-6, "the settings matter");
 
-  await page.getByRole("button", { name: "New pair" }).click();
+  await page.getByRole("button", { name: "Files and settings" }).click();
   await page.getByRole("button", { name: "Swap" }).click();
   await page.getByRole("button", { name: "Register" }).click();
   await page.locator("canvas").waitFor();
@@ -270,7 +275,7 @@ test("all can be done with the keyboard", async () => {
   await page.keyboard.press("Enter");
   assert.equal((await coming).suggestedFilename(), "T_target_source.txt");
   await page.locator("body").press("Escape");
-  await page.getByRole("button", { name: "New pair" }).focus();
+  await page.getByRole("button", { name: "Files and settings" }).focus();
   await page.keyboard.press("Enter");
   assert.equal(await page.evaluate(() => document.activeElement?.textContent), "Register");
   assert.deepEqual(wrong, []);

@@ -116,8 +116,15 @@ test("shows the verdict, its reasons, and the alternatives that are clicked", as
   await others.nth(1).click();
   await settle(page);
   assert.ok(difference(first, await pixels(page)) > 0.005);
-  const text = (await page.locator("pre").textContent()) ?? "";
+  await page.locator("#copy").click();
+  await page.getByText("copied", { exact: true }).waitFor();
+  const text = await page.evaluate(() => navigator.clipboard.readText());
   assert.deepEqual(text.split(/\s+/).map(Number), found.alternatives[0].T_target_source.flat());
+  // Clicked with the mouse, a button does not keep the space bar for itself.
+  await page.getByRole("button", { name: "After" }).click();
+  await page.keyboard.press(" ");
+  assert.equal(await page.getByRole("button", { name: "Before" }).getAttribute("aria-pressed"), "true");
+  await page.keyboard.press(" ");
   await page.keyboard.press("0");
   await settle(page);
   assert.equal(difference(first, await pixels(page)), 0);

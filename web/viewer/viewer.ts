@@ -27,7 +27,9 @@ export interface Distances {
 
 export type Coloring = "clouds" | "distances" | "own";
 export type Side = "before" | "after";
-export type Up = "x" | "y" | "z";
+/** What is up: scans have z there, models often y, and what a camera sees −y. */
+export const UPS = ["x", "-x", "y", "-y", "z", "-z"] as const;
+export type Up = (typeof UPS)[number];
 
 /** Colours of a theme, as CSS has them. */
 export interface Palette {
@@ -316,7 +318,8 @@ export class Viewer {
   }
 
   #newControls(): OrbitControls {
-    this.#camera.up.set(Number(this.#up === "x"), Number(this.#up === "y"), Number(this.#up === "z"));
+    const along = (axis: string) => (this.#up === axis ? 1 : this.#up === `-${axis}` ? -1 : 0);
+    this.#camera.up.set(along("x"), along("y"), along("z"));
     const controls = new OrbitControls(this.#camera, this.canvas);
     controls.enableDamping = false;
     controls.zoomToCursor = !this.#split;

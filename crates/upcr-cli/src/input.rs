@@ -64,6 +64,16 @@ pub fn name_file(error: Error, source: &Path, target: &Path) -> anyhow::Error {
     anyhow::Error::new(error).context(path)
 }
 
+/// What files are called in a page that may be sent to others: without their folders, where that tells them apart.
+pub fn short_names(paths: &[&Path]) -> Vec<String> {
+    let short: Vec<_> = paths.iter().map(|path| path.file_name().unwrap_or(path.as_os_str())).collect();
+    let alike = (1..short.len()).any(|i| short[..i].contains(&short[i]));
+    let named = |(path, name): (&&Path, _)| {
+        if alike { path.display().to_string() } else { Path::new(name).display().to_string() }
+    };
+    paths.iter().zip(short).map(named).collect()
+}
+
 fn intrinsics(text: &str) -> anyhow::Result<Intrinsics> {
     let [fx, fy, cx, cy] = numbers(text)?[..] else { bail!("four numbers are needed") };
     Ok(Intrinsics { fx, fy, cx, cy })
@@ -78,4 +88,17 @@ fn viewpoint(text: &str) -> anyhow::Result<Viewpoint> {
 
 fn numbers(text: &str) -> Result<Vec<f64>, ParseFloatError> {
     text.split(',').map(|v| v.trim().parse()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_short_where_they_differ() {
+        let names = |paths: &[&str]| short_names(&paths.iter().map(Path::new).collect::<Vec<_>>());
+        assert_eq!(names(&["/data/a.ply", "b/c.ply"]), ["a.ply", "c.ply"]);
+        assert_eq!(names(&["x/a.ply", "y/a.ply", "b.ply"]), ["x/a.ply", "y/a.ply", "b.ply"]);
+        assert_eq!(names(&[".."]), [".."]);
+    }
 }

@@ -207,9 +207,10 @@ fn run_one(args: &Args, source_path: &Path, target_path: &Path) -> Result<Status
         io::write_cloud(path, &source.transformed(&found.T_target_source))?;
     }
     if let Some(path) = &args.report {
-        let [a, b] = [source_path, target_path].map(|path| path.display().to_string());
+        let names = input::short_names(&[source_path, target_path]);
         let comments = [io::read_comments(source_path)?, io::read_comments(target_path)?];
-        let page = Page::of_registration((&a, &source), (&b, &target), &found).with_comments(&comments);
+        let page = Page::of_registration((&names[0], &source), (&names[1], &target), &found)
+            .with_comments(&comments);
         write_atomically(path, page.html()?.as_bytes())?;
     }
     let summary = summary(&found, args, source_path, target_path);

@@ -42,13 +42,14 @@ pub fn run(args: &Args) -> Result<Status> {
     let mut progress = Progress::new();
     let mut clouds: Vec<(String, PointCloud)> = Vec::new();
     let mut comments = Vec::new();
-    for path in &args.clouds {
+    let paths: Vec<&Path> = args.clouds.iter().map(PathBuf::as_path).collect();
+    for (path, name) in paths.iter().zip(input::short_names(&paths)) {
         progress.step("reading");
         let cloud = args.reading.read(path)?;
         if cloud.finite().is_empty() {
             bail!("{}: there is no point with finite coordinates in it", path.display());
         }
-        clouds.push((path.display().to_string(), cloud));
+        clouds.push((name, cloud));
         comments.push(io::read_comments(path)?);
     }
     if let Some(stream) = stream {

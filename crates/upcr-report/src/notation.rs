@@ -54,7 +54,8 @@ pub fn notations(pose: &Rigid) -> Vec<Notation> {
         },
         Notation {
             name: "CloudCompare",
-            about: "For Edit, Apply transformation, or a file for -APPLY_TRANS; decimals without exponents.",
+            about: "For Edit, Apply transformation, or a file for -APPLY_TRANS; decimals without exponents. It is of the files' own \
+                    coordinates: clouds with large ones are not to be shifted when they are opened.",
             text: rows.map(|row| row.map(|v| v.to_string()).join(" ")).join("\n"),
         },
     ]
