@@ -40,7 +40,7 @@ upcr("register", ...scans.map((path) => path.slice(scratch.length + 1)), "--repo
 await shoot("report-alternatives.png", twofold, {}, press("1", "]"));
 await shoot("report-phone.png", sample, phone, press());
 
-await shoot("page.png", built, {}, press());
+await shoot("page.png", built, { viewport: { width: 1100, height: 560 } }, press());
 /** @param {import("playwright-core").Page} page */
 const registered = async (page) => {
   await page.getByRole("button", { name: "Try the samples" }).click();
