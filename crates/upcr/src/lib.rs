@@ -4,6 +4,7 @@ pub mod cloud;
 pub mod error;
 pub mod features;
 mod free_direction;
+mod hash;
 mod hypothesis;
 pub mod io;
 mod memory;

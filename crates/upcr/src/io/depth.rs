@@ -5,8 +5,13 @@ use crate::PointCloud;
 use super::input::{Fallible, Fault, Input, check_expansion, malformed, unsupported};
 use super::{Format, Intrinsics, ReadOptions, Reader};
 
-pub(super) const FORMAT: Format =
-    Format { name: "depth PNG", extensions: &["png"], read: Reader::Cloud(read), write: None };
+pub(super) const FORMAT: Format = Format {
+    name: "depth PNG",
+    extensions: &["png"],
+    read: Reader::Cloud(read),
+    write: None,
+    comments: None,
+};
 
 /// A Kinect's depth camera, and the image size it belongs to.
 const KINECT: Intrinsics = Intrinsics { fx: 585.0, fy: 585.0, cx: 320.0, cy: 240.0 };

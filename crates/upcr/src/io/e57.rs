@@ -13,8 +13,13 @@ use super::input::{Fallible, Fault, Input, malformed};
 use super::output::Output;
 use super::{Format, ReadOptions, Reader, WriteOptions, check_finite};
 
-pub(super) const FORMAT: Format =
-    Format { name: "E57", extensions: &["e57"], read: Reader::Cloud(read), write: Some(write) };
+pub(super) const FORMAT: Format = Format {
+    name: "E57",
+    extensions: &["e57"],
+    read: Reader::Cloud(read),
+    write: Some(write),
+    comments: None,
+};
 
 /// Attributes of an XML element, and namespaces of all, that are more than any file needs.
 const MOST_ATTRIBUTES: usize = 1000;

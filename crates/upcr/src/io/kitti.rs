@@ -10,8 +10,13 @@ use super::output::Output;
 use super::scalar::{ByteOrder, Scalar};
 use super::{Format, ReadOptions, Reader, WriteOptions};
 
-pub(super) const FORMAT: Format =
-    Format { name: "KITTI", extensions: &["bin"], read: Reader::Cloud(read), write: Some(write) };
+pub(super) const FORMAT: Format = Format {
+    name: "KITTI",
+    extensions: &["bin"],
+    read: Reader::Cloud(read),
+    write: Some(write),
+    comments: None,
+};
 
 /// Bytes of a point.
 const STRIDE: u64 = 16;

@@ -29,7 +29,7 @@ use std::fs::File;
 use std::io::{Read, Seek, Write};
 use std::path::Path;
 
-use crate::{Error, PointCloud, Result, TriangleMesh};
+use crate::{Error, PointCloud, Result, TriangleMesh, hash::fnv1a};
 use input::{Fallible, Fault, Input, malformed, unsupported};
 use output::{Output, write_atomically, write_buffered};
 
@@ -43,8 +43,11 @@ struct Format {
     extensions: &'static [&'static str],
     read: Reader,
     write: Option<Writer>,
+    /// What its files say to people, where they have a place for that.
+    comments: Option<CommentReader>,
 }
 
+type CommentReader = fn(&mut Input) -> Fallible<Vec<String>>;
 type Writer = fn(&mut Output, &PointCloud, &WriteOptions) -> Fallible<()>;
 
 /// What a format's files hold.
@@ -95,7 +98,7 @@ pub struct Intrinsics {
 pub struct ReadOptions {
     /// Points sampled on a mesh (OFF, OBJ, STL).
     pub mesh_samples: usize,
-    /// Seed of that sampling.
+    /// Seed of that sampling, of which copies of a mesh that lie elsewhere make different points.
     pub seed: u64,
     /// Camera of a depth image; `None` takes a Kinect's 585 px focal length and centre (320, 240), which
     /// 640×480 images only may do.
@@ -174,8 +177,7 @@ pub fn read_cloud_from(
     take(name, format.name, stream, |input| cloud_of(format, input, options))
 }
 
-/// What a file says to people: the comments in the header of a PLY. Those of other formats are notes to programs, and there
-/// are none here.
+/// What a file says to people: the comments in the header of a PLY. Those of other formats are notes to programs: there are none.
 ///
 /// # Errors
 /// As [`read_cloud`].
@@ -191,11 +193,7 @@ pub fn read_comments(path: impl AsRef<Path>) -> Result<Vec<String>> {
 pub fn read_comments_from(name: impl AsRef<Path>, stream: impl Read + Seek) -> Result<Vec<String>> {
     let name = name.as_ref();
     let format = format_of(name)?;
-    if format.name == ply::FORMAT.name {
-        take(name, format.name, stream, ply::read_comments)
-    } else {
-        Ok(Vec::new())
-    }
+    format.comments.map_or(Ok(Vec::new()), |read| take(name, format.name, stream, read))
 }
 
 /// Reads a mesh: OFF, OBJ, STL, or the vertices and faces of a PLY. Polygons are cut into fans of triangles.
@@ -288,11 +286,18 @@ fn cloud_of(format: &Format, input: &mut Input, options: &ReadOptions) -> Fallib
             if mesh.triangles.is_empty() {
                 PointCloud::from_points(mesh.vertices)
             } else {
-                mesh.sample(options.mesh_samples, options.seed)
+                mesh.sample(options.mesh_samples, options.seed ^ place(&mesh))
             }
         }
     };
     Ok(PointCloud { viewpoint: cloud.viewpoint.or(options.viewpoint), ..cloud })
+}
+
+/// A number that differs where a mesh lies elsewhere: two copies of one are sampled at different points then, as two scans
+/// are, and do not fit each other at one pose better than at all that look the same.
+fn place(mesh: &TriangleMesh) -> u64 {
+    let bytes: Vec<u8> = mesh.vertices.iter().flatten().flat_map(|v| v.to_le_bytes()).collect();
+    fnv1a(&bytes)
 }
 
 fn mesh_of(format: &Format, input: &mut Input) -> Fallible<TriangleMesh> {

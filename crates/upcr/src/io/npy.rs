@@ -11,8 +11,13 @@ use super::output::{Output, write_atomically};
 use super::scalar::{ByteOrder, Scalar};
 use super::{Format, ReadOptions, Reader, WriteOptions, explain};
 
-pub(super) const FORMAT: Format =
-    Format { name: "NPY", extensions: &["npy"], read: Reader::Cloud(read), write: Some(write) };
+pub(super) const FORMAT: Format = Format {
+    name: "NPY",
+    extensions: &["npy"],
+    read: Reader::Cloud(read),
+    write: Some(write),
+    comments: None,
+};
 
 const MAGIC: &[u8; 6] = b"\x93NUMPY";
 

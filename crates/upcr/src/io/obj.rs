@@ -6,7 +6,7 @@ use super::input::{Fallible, Input, malformed, position};
 use super::{Format, Reader};
 
 pub(super) const FORMAT: Format =
-    Format { name: "OBJ", extensions: &["obj"], read: Reader::Mesh(read), write: None };
+    Format { name: "OBJ", extensions: &["obj"], read: Reader::Mesh(read), write: None, comments: None };
 
 fn read(input: &mut Input) -> Fallible<TriangleMesh> {
     let mut mesh = TriangleMesh::default();

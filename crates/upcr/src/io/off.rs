@@ -6,7 +6,7 @@ use super::input::{Fallible, Input, malformed, position, unsupported};
 use super::{Format, Reader};
 
 pub(super) const FORMAT: Format =
-    Format { name: "OFF", extensions: &["off"], read: Reader::Mesh(read), write: None };
+    Format { name: "OFF", extensions: &["off"], read: Reader::Mesh(read), write: None, comments: None };
 
 fn read(input: &mut Input) -> Fallible<TriangleMesh> {
     let mut line = String::new();

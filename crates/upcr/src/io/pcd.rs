@@ -10,8 +10,13 @@ use super::output::Output;
 use super::scalar::{ByteOrder, Scalar, fits_f32};
 use super::{Encoding, Format, ReadOptions, Reader, WriteOptions, lzf};
 
-pub(super) const FORMAT: Format =
-    Format { name: "PCD", extensions: &["pcd"], read: Reader::Cloud(read), write: Some(write) };
+pub(super) const FORMAT: Format = Format {
+    name: "PCD",
+    extensions: &["pcd"],
+    read: Reader::Cloud(read),
+    write: Some(write),
+    comments: None,
+};
 
 /// Pose that stands for none: at the origin, not turned.
 const NO_VIEWPOINT: [f64; 7] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];

@@ -15,6 +15,7 @@ pub(super) const FORMAT: Format = Format {
     extensions: &["ply"],
     read: Reader::CloudOrMesh(read_cloud, read_mesh),
     write: Some(write),
+    comments: Some(read_comments),
 };
 
 /// Type of a property.
@@ -115,7 +116,7 @@ fn read_mesh(input: &mut Input) -> Fallible<TriangleMesh> {
 }
 
 /// What the header says to people.
-pub(super) fn read_comments(input: &mut Input) -> Fallible<Vec<String>> {
+fn read_comments(input: &mut Input) -> Fallible<Vec<String>> {
     let mut line = String::new();
     let mut comments = Vec::new();
     while input.line(&mut line)? && line.trim_end() != "end_header" {

@@ -7,7 +7,7 @@ use super::scalar::{ByteOrder, Scalar};
 use super::{Format, Reader};
 
 pub(super) const FORMAT: Format =
-    Format { name: "STL", extensions: &["stl"], read: Reader::Mesh(read), write: None };
+    Format { name: "STL", extensions: &["stl"], read: Reader::Mesh(read), write: None, comments: None };
 
 /// Bytes before the first triangle of a binary file, and of a triangle.
 const HEADER: u64 = 84;

@@ -19,6 +19,7 @@ pub(super) const FORMAT: Format = Format {
     extensions: &["xyz", "csv", "txt", "xyzn", "xyzrgb", "asc"],
     read: Reader::Cloud(read),
     write: Some(write),
+    comments: None,
 };
 
 /// How far a normal's squared length may be from 1, for files written with two digits.

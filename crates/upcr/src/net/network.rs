@@ -101,7 +101,7 @@ impl Network {
         let head = inputs.zip(outputs).enumerate();
         let head = head.map(|(i, (inputs, outputs))| weights.linear(&format!("head.{i}"), inputs, outputs));
         let head = Head::new(head.collect::<Result<Vec<_>>>()?, slope, config.rotation);
-        let fingerprint = fnv1a(bytes);
+        let fingerprint = crate::hash::fnv1a(bytes);
         Ok(Self {
             trained: weights.trained,
             fingerprint,
@@ -406,11 +406,4 @@ impl Rooms {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(room);
         result
     }
-}
-
-/// The 64-bit Fowler–Noll–Vo hash (1a), of eight bytes at a time.
-fn fnv1a(bytes: &[u8]) -> u64 {
-    let (words, rest) = bytes.as_chunks::<8>();
-    let words = words.iter().map(|&word| u64::from_le_bytes(word)).chain(rest.iter().map(|&b| u64::from(b)));
-    words.fold(0xcbf2_9ce4_8422_2325, |hash, word| (hash ^ word).wrapping_mul(0x0000_0100_0000_01b3))
 }

@@ -13,11 +13,21 @@ use super::output::Output;
 use super::{Format, ReadOptions, Reader, WriteOptions};
 use header::Header;
 
-pub(super) const FORMAT: Format =
-    Format { name: "LAS", extensions: &["las"], read: Reader::Cloud(read), write: Some(write_las) };
+pub(super) const FORMAT: Format = Format {
+    name: "LAS",
+    extensions: &["las"],
+    read: Reader::Cloud(read),
+    write: Some(write_las),
+    comments: None,
+};
 
-pub(super) const COMPRESSED: Format =
-    Format { name: "LAZ", extensions: &["laz"], read: Reader::Cloud(read), write: Some(write_laz) };
+pub(super) const COMPRESSED: Format = Format {
+    name: "LAZ",
+    extensions: &["laz"],
+    read: Reader::Cloud(read),
+    write: Some(write_laz),
+    comments: None,
+};
 
 /// Records written in one go.
 const BATCH: usize = 50_000;
