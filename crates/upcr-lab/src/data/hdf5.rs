@@ -111,7 +111,7 @@ impl<'a> Bytes<'a> {
         Ok(self.take(1)?[0])
     }
 
-    fn expect(&mut self, mark: &[u8], what: &str) -> Fallible<()> {
+    fn demand(&mut self, mark: &[u8], what: &str) -> Fallible<()> {
         match self.0.strip_prefix(mark) {
             Some(rest) => {
                 self.0 = rest;
@@ -198,7 +198,7 @@ impl<'a> Header<'a> {
                 let (address, length) = (content.number(8)?, content.number(8)?);
                 let mut more = file.block(address, length)?;
                 if flags.is_some() {
-                    more.expect(b"OCHK", "a header's continuation")?;
+                    more.demand(b"OCHK", "a header's continuation")?;
                     // A checksum ends it.
                     more.0 = &more.0[..more.0.len().saturating_sub(4)];
                 }
@@ -245,7 +245,7 @@ fn read_dataset(bytes: &[u8], name: &str) -> Fallible<Array> {
 /// II: the superblock.
 fn root_address(file: &File) -> Fallible<u64> {
     let mut block = file.block(0, file.bytes.len().min(96) as u64)?;
-    block.expect(SIGNATURE, "the signature")?;
+    block.demand(SIGNATURE, "the signature")?;
     let version = block.byte()?;
     // What is between the sizes of addresses and lengths and the base address, and from there to the root's.
     let (to_sizes, to_base, to_root) = match version {
@@ -272,7 +272,7 @@ fn find_link(file: &File, group: &Header, name: &str) -> Fallible<Option<u64>> {
         let (tree, heap) = (table.number(8)?, table.number(8)?);
         // III.D: the names.
         let mut head = file.block(heap, 32)?;
-        head.expect(b"HEAP", "a group's heap")?;
+        head.demand(b"HEAP", "a group's heap")?;
         head.take(4)?;
         let length = head.number(8)?;
         head.take(8)?;
@@ -313,7 +313,7 @@ fn find_symbol(
 ) -> Fallible<Option<u64>> {
     if above == Some(0) {
         let mut head = file.block(address, 8)?;
-        head.expect(b"SNOD", "a table of symbols")?;
+        head.demand(b"SNOD", "a table of symbols")?;
         head.take(2)?;
         let count = head.number(2)?;
         let mut entries = file.block(address.saturating_add(8), count * 40)?;
@@ -351,7 +351,7 @@ struct TreeNode {
 impl TreeNode {
     fn read(file: &File, address: u64, above: Option<u8>, kind: u8) -> Fallible<Self> {
         let mut head = file.block(address, 24)?;
-        head.expect(b"TREE", "a node of a tree")?;
+        head.demand(b"TREE", "a node of a tree")?;
         let (found, level, count) = (head.byte()?, head.byte()?, head.number(2)?);
         if found != kind || above.is_some_and(|above| level.checked_add(1) != Some(above)) {
             return malformed("a node of another tree");
