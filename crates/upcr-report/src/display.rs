@@ -9,6 +9,16 @@ use upcr::{CloudRole, Error, PointCloud, Result, Rigid};
 /// Clouds with more points are thinned to so many.
 pub const MOST_POINTS: usize = 1_000_000;
 
+/// Red, green and blue of clouds that have no colours of their own, on light pages; after the last comes the first again.
+pub const CLOUD_COLORS: [[u8; 3]; 6] = [
+    [0xcf, 0x5f, 0x0c],
+    [0x11, 0x67, 0x8f],
+    [0x5f, 0x8a, 0x1d],
+    [0x7d, 0x55, 0xb5],
+    [0xb8, 0x44, 0x7e],
+    [0x6b, 0x63, 0x57],
+];
+
 /// Steps along the longest edge of a cloud's box: as fine as single precision is, which draws it.
 const STEPS: f64 = ((1 << 24) - 1) as f64;
 /// Queries of one task.
@@ -159,6 +169,17 @@ mod tests {
             .chunks(9)
             .map(|p| std::array::from_fn(|k| shown.origin[k] + shown.step * number(&p[3 * k..3 * k + 3])))
             .collect()
+    }
+
+    #[test]
+    fn colors_are_those_of_the_style_sheet() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../web/report/style.css");
+        let sheet = std::fs::read_to_string(path).unwrap();
+        for (i, [r, g, b]) in CLOUD_COLORS.into_iter().enumerate() {
+            let declared = sheet.split_once(&format!("--cloud-{i}: ")).unwrap().1;
+            assert!(declared.starts_with(&format!("#{r:02x}{g:02x}{b:02x};")), "{i}");
+        }
+        assert!(!sheet.contains(&format!("--cloud-{}: ", CLOUD_COLORS.len())));
     }
 
     #[test]

@@ -7,6 +7,6 @@ mod display;
 mod notation;
 mod page;
 
-pub use display::MOST_POINTS;
+pub use display::{CLOUD_COLORS, MOST_POINTS};
 pub use notation::{Notation, notations};
 pub use page::{Contents, Page};

@@ -24,13 +24,11 @@ use re_sdk_types::components::{Color, Radius, TextLogLevel};
 use upcr::cloud::random_indices;
 use upcr::{PointCloud, Rigid};
 use upcr_lab::files::write_atomically;
-use upcr_report::MOST_POINTS;
+use upcr_report::{CLOUD_COLORS, MOST_POINTS};
 
 use super::{Layout, Where};
 use crate::{describe, output};
 
-/// Colours of clouds that have none of their own, as in reports.
-const COLORS: [u32; 6] = [0xcf5f_0cff, 0x1167_8fff, 0x5f8a_1dff, 0x7d55_b5ff, 0xb844_7eff, 0x6b63_57ff];
 /// Radius of a point on the screen.
 const RADIUS: f32 = 1.5;
 /// Coordinates larger than so many diagonals of their cloud get an origin of their own: single precision then resolves less
@@ -105,7 +103,7 @@ impl Stream {
             .collect();
         let colors: Vec<Color> = match &cloud.colors {
             Some(own) => chosen.iter().map(|&i| own[i].into()).collect(),
-            None => vec![Color::from_u32(COLORS[color % COLORS.len()])],
+            None => vec![CLOUD_COLORS[color % CLOUD_COLORS.len()].into()],
         };
         let points = Points3D::new(positions).with_colors(colors).with_radii([Radius::new_ui_points(RADIUS)]);
         let path = entity_path!("clouds", name);
