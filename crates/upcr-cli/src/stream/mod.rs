@@ -2,6 +2,7 @@
 
 #[cfg(not(feature = "rerun"))]
 mod absent;
+mod registration;
 #[cfg(feature = "rerun")]
 mod viewer;
 
@@ -16,6 +17,7 @@ use clap::{Arg, Command};
 
 #[cfg(not(feature = "rerun"))]
 pub use absent::Stream;
+pub use registration::Shown;
 #[cfg(feature = "rerun")]
 pub use viewer::Stream;
 
