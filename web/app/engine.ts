@@ -4,8 +4,6 @@ import type { Asked, Choices, Told } from "./messages.ts";
 
 type Answer<K extends Told["kind"]> = Extract<Told, { kind: K }>;
 
-/** What the library says of files and choices that it cannot use. */
-export class Refused extends Error {}
 /** The reader has lost interest. */
 export class Cancelled extends Error {}
 
@@ -56,7 +54,7 @@ export class Engine {
 
   #ask(asked: Asked): Promise<Told> {
     const worker = this.#worker;
-    if (!worker || this.#waiting) return Promise.reject(new Refused("Something else is under way: wait until it is done."));
+    if (!worker || this.#waiting) return Promise.reject(new Error("Something else is under way: wait until it is done."));
     return new Promise((resolve, reject) => {
       this.#waiting = { resolve, reject };
       worker.postMessage(asked);
@@ -71,9 +69,7 @@ export class Engine {
       return;
     }
     if (told.broken) this.#end();
-    waiting?.reject(told.broken
-      ? new Error(`Out of memory, or a fault of this page: ${told.message}`)
-      : new Refused(told.message));
+    waiting?.reject(new Error(told.broken ? `Out of memory, or a fault of this page: ${told.message}` : told.message));
   }
 
   #end(): void {

@@ -2,7 +2,7 @@
 
 import { Contents } from "@upcr/report/contents.ts";
 import { adopt, button, el } from "@upcr/report/dom.ts";
-import { decode, take } from "@upcr/report/held.ts";
+import { decode, take } from "@upcr/report/embedded.ts";
 import { type Report, showReport } from "@upcr/report/report.ts";
 import { turnTheme } from "@upcr/report/theme.ts";
 import reportStyle from "@upcr/report/style.css";
@@ -87,8 +87,7 @@ function busy(is: boolean): void {
   working.hidden = !is;
   go.disabled = is || !pair.both || !engine;
   sample.disabled = is;
-  pair.swap.disabled = is || !pair.both;
-  for (const input of pair.element.querySelectorAll("input")) input.disabled = is;
+  pair.hold(is);
 }
 
 async function run(): Promise<void> {

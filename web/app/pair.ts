@@ -19,6 +19,7 @@ export class Pair {
   readonly #files: [File | null, File | null] = [null, null];
   readonly #inputs: HTMLInputElement[] = [];
   readonly #names: HTMLElement[] = [];
+  #held = false;
 
   constructor() {
     const slots = ROLES.map(([role, what], i) => {
@@ -43,7 +44,7 @@ export class Pair {
         if (files.length !== 1 || !files[0]) return;
         event.preventDefault();
         event.stopPropagation();
-        this.#put(i, files[0]);
+        if (!this.#held) this.#put(i, files[0]);
       });
     });
     this.element = el("div", { class: "pair" }, ...slots);
@@ -57,7 +58,7 @@ export class Pair {
   /** Puts files where there is room, two as source and target; one beside two begins a new pair. */
   take(files: readonly File[]): void {
     const [first, second] = files;
-    if (!first) return;
+    if (!first || this.#held) return;
     if (second) {
       this.#show(0, first);
       this.#put(1, second);
@@ -65,6 +66,13 @@ export class Pair {
       if (this.both) this.#clear();
       this.#put(this.#files[0] ? 1 : 0, first);
     }
+  }
+
+  /** Whether the files stay as they are for now. */
+  hold(held: boolean): void {
+    this.#held = held;
+    for (const input of this.#inputs) input.disabled = held;
+    this.#offer();
   }
 
   accept(extensions: readonly string[]): void {
@@ -79,13 +87,17 @@ export class Pair {
   #show(index: number, file: File): void {
     this.#files[index] = file;
     this.#names[index]?.replaceChildren(el("bdi", {}, file.name), ` ${size(file.size)}`);
-    this.swap.disabled = !this.both;
+    this.#offer();
+  }
+
+  #offer(): void {
+    this.swap.disabled = this.#held || !this.both;
   }
 
   #clear(): void {
     this.#files.fill(null);
     for (const name of this.#names) name.textContent = EMPTY;
-    this.swap.disabled = true;
+    this.#offer();
   }
 
   #turn(): void {

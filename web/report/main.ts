@@ -1,6 +1,6 @@
 /** The page that the command line writes: all that it shows is in elements that nothing runs. */
 
-import { decode, take } from "./held.ts";
+import { decode, take } from "./embedded.ts";
 import { Contents } from "./contents.ts";
 import { adopt } from "./dom.ts";
 import { showReport } from "./report.ts";

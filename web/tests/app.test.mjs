@@ -1,21 +1,13 @@
 // The page that registers, as its readers meet it: opened from a file or from a server, in a browser.
 import assert from "node:assert/strict";
-import { existsSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { existsSync, readFileSync, writeFileSync } from "node:fs";
 import { createServer } from "node:http";
 import { join } from "node:path";
-import { after, before, test } from "node:test";
+import { test } from "node:test";
 
-import { built, difference, launch, open, pixels, ply, random, samples, scratch, settle, share, table, upcr } from "./tools.mjs";
+import { built, difference, inBrowser, pixels, ply, random, samples, scratch, settle, share, table, upcr } from "./tools.mjs";
 
-/** @type {import("playwright-core").Browser} */
-let browser;
-before(async () => {
-  browser = await launch();
-});
-after(async () => {
-  await browser.close();
-  rmSync(scratch, { recursive: true });
-});
+const open = inBrowser();
 
 const [source, target] = [join(samples, "source.ply"), join(samples, "target.ply")];
 
@@ -76,7 +68,7 @@ async function save(page, button) {
 }
 
 test("registers the samples as the command line does, and gives pose, aligned cloud and report away", async () => {
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   await page.getByRole("button", { name: "Try the samples" }).click();
   await page.locator("canvas").waitFor();
   await settle(page);
@@ -99,7 +91,7 @@ test("registers the samples as the command line does, and gives pose, aligned cl
     assert.ok(aligned.endsWith(`source_aligned.${format}`));
     assert.ok(farthest(told(aligned, target), [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]) < 2e-3, format);
   }
-  const report = await open(browser, await save(page, "Report"));
+  const report = await open(await save(page, "Report"));
   assert.deepEqual(await pose(report.page), found);
   assert.deepEqual([...wrong, ...report.wrong], []);
   await report.close();
@@ -113,7 +105,7 @@ test("registers a pair of the Stanford bunny as the command line does", async (c
     return;
   }
   const [a, b] = [join(folder, "bun000.ply"), join(folder, "bun045.ply")];
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   await register(page, a, b);
   await page.getByRole("heading", { name: "Registered", exact: true }).waitFor();
   assert.ok(farthest(await pose(page), told(a, b)) < 1e-4);
@@ -122,7 +114,7 @@ test("registers a pair of the Stanford bunny as the command line does", async (c
 });
 
 test("goes by the settings, and swaps", async () => {
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   await page.getByText("Settings").click();
   await page.getByLabel("First pose from").selectOption("features");
   await page.getByLabel("Refinement").selectOption("plane");
@@ -144,7 +136,7 @@ test("goes by the settings, and swaps", async () => {
 });
 
 test("saves the alternative that is shown", async () => {
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   await register(page, table("table-a.ply", 1), table("table-b.ply", 2));
   const found = await pose(page);
   await page.keyboard.press("1");
@@ -162,7 +154,7 @@ test("saves the alternative that is shown", async () => {
 });
 
 test("takes two files that are dropped anywhere", async () => {
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   const files = [source, target].map((path) => readFileSync(path, "latin1"));
   const dropped = await page.evaluateHandle(([a, b]) => {
     const transfer = new DataTransfer();
@@ -180,7 +172,7 @@ test("takes two files that are dropped anywhere", async () => {
 });
 
 test("tells what is wrong with a file, and goes on", async () => {
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   const broken = join(scratch, "broken.ply");
   writeFileSync(broken, "ply\nformat ascii 1.0\nelement vertex 4000000000\nproperty float x\nproperty float y\nproperty float z\nend_header\n1 2 3\n");
   await page.locator("#file-0").setInputFiles(broken);
@@ -204,13 +196,13 @@ test("hostile names and comments are text", async () => {
   const comment = "</script><script>alert(3)</script><b>&lt;";
   const bad = `"><img src=x onerror=alert(1)><script>alert(2)<!--&amp;\u2028'.ply`;
   const cloud = ply(bad, 2000, (i) => [Math.sin(i), Math.cos(1.7 * i), i / 1000], comment);
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   await register(page, cloud, target);
   assert.ok((await page.locator("h1").first().textContent())?.includes(bad));
   assert.ok((await page.locator(".slot").first().textContent())?.includes(bad));
   assert.equal(await page.locator(".clouds details p").first().textContent(), comment);
   assert.equal(await page.locator("img, .clouds b").count(), 0);
-  const report = await open(browser, await save(page, "Report"));
+  const report = await open(await save(page, "Report"));
   assert.ok((await report.page.locator("h1").textContent())?.includes(bad));
   assert.deepEqual([...wrong, ...report.wrong], []);
   await report.close();
@@ -218,7 +210,7 @@ test("hostile names and comments are text", async () => {
 });
 
 test("sends nothing: neither the page nor its worker can", async () => {
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   for (const url of ["https://example.org/", "http://127.0.0.1:9/"]) {
     assert.equal(await page.evaluate((to) => fetch(to, { method: "POST", body: "scan", mode: "no-cors" }).then(() => "sent", () => "refused"), url), "refused");
   }
@@ -243,7 +235,7 @@ test("needs one request of a server", async () => {
   await new Promise((listening) => server.listen(0, "127.0.0.1", () => listening(null)));
   const address = server.address();
   assert.ok(address && typeof address === "object");
-  const { page, wrong, close } = await open(browser, `http://127.0.0.1:${address.port}/`);
+  const { page, wrong, close } = await open(`http://127.0.0.1:${address.port}/`);
   await page.getByRole("button", { name: "Try the samples" }).click();
   await page.locator("canvas").waitFor();
   assert.deepEqual([asked, wrong], [["/"], []]);
@@ -252,7 +244,7 @@ test("needs one request of a server", async () => {
 });
 
 test("all can be done with the keyboard", async () => {
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   /** @param {string} name */
   const tabTo = async (name) => {
     for (let i = 0; i < 40; i += 1) {
@@ -285,7 +277,7 @@ test("all can be done with the keyboard", async () => {
 test("is readable on a phone, light and dark", async () => {
   const backgrounds = [];
   for (const colorScheme of /** @type {const} */ (["light", "dark"])) {
-    const { page, wrong, close } = await open(browser, built, {
+    const { page, wrong, close } = await open(built, {
       viewport: { width: 360, height: 740 }, hasTouch: true, isMobile: true, colorScheme,
     });
     for (const act of [async () => {}, async () => {
@@ -325,7 +317,7 @@ test("a million points a scan: the page answers meanwhile, and can be told to st
     return /** @type {[number, number, number]} */ ([u, v, Math.sin(u) + 0.4 * Math.cos(3 * v + u) + 0.02 * u * v]);
   };
   const scans = [ply("hill-a.ply", 1_000_000, hill(0)), ply("hill-b.ply", 1_000_000, hill(1))];
-  const { page, wrong, close } = await open(browser, built);
+  const { page, wrong, close } = await open(built);
   await page.evaluate(`{
     window.slowest = 0;
     let last = performance.now();

@@ -1,27 +1,19 @@
 // The report as its readers meet it: opened from a file, in a browser, without a network.
 import assert from "node:assert/strict";
-import { readFileSync, rmSync, statSync, writeFileSync } from "node:fs";
+import { readFileSync, statSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
-import { after, before, test } from "node:test";
+import { test } from "node:test";
 
-import { difference, launch, open, pixels, ply, random, samples, scratch, settle, share, table, upcr } from "./tools.mjs";
+import { difference, inBrowser, pixels, ply, random, samples, scratch, settle, share, table, upcr } from "./tools.mjs";
 
-/** @type {import("playwright-core").Browser} */
-let browser;
-before(async () => {
-  browser = await launch();
-});
-after(async () => {
-  await browser.close();
-  rmSync(scratch, { recursive: true });
-});
+const open = inBrowser();
 
 const [source, target] = [join(samples, "source.ply"), join(samples, "target.ply")];
 
 test("opens, draws, and shows before and after", async () => {
   const path = join(scratch, "sample.html");
   upcr("register", source, target, "--report", path);
-  const { page, wrong, close } = await open(browser, path);
+  const { page, wrong, close } = await open(path);
   const shown = await pixels(page);
   assert.ok(share(shown, "orange") > 0.01 && share(shown, "blue") > 0.01, "both clouds are there");
   await page.keyboard.press(" ");
@@ -53,7 +45,7 @@ test("opens, draws, and shows before and after", async () => {
 test("turns and zooms by keys and by pointer", async () => {
   const path = join(scratch, "keys.html");
   upcr("view", source, target, "--no-open", "--out", path);
-  const { page, wrong, close } = await open(browser, path);
+  const { page, wrong, close } = await open(path);
   const first = await pixels(page);
   for (const key of ["ArrowLeft", "ArrowUp", "+", "]"]) {
     const earlier = await pixels(page);
@@ -85,7 +77,7 @@ test("copies the pose that the JSON has, digit by digit", async () => {
   const rows = /"T_target_source": (\[[^a-z]*?\]\s*\])/.exec(json)?.[1] ?? "";
   const digits = rows.split(/[\s,[\]]+/).filter((word) => word !== "");
   assert.equal(digits.length, 16);
-  const { page, wrong, close } = await open(browser, path);
+  const { page, wrong, close } = await open(path);
   const told = [];
   for (const index of [0, 1, 2, 3, 4, 5]) {
     await page.locator("#notation").selectOption({ index });
@@ -107,7 +99,7 @@ test("shows the verdict, its reasons, and the alternatives that are clicked", as
   const [a, b] = [table("a.ply", 1, [500_000, 5_400_000, 300]), table("b.ply", 2)];
   const found = JSON.parse(upcr("register", a, b, "--json", "--report", path));
   assert.deepEqual(found.reasons, ["ambiguous"]);
-  const { page, wrong, close } = await open(browser, path);
+  const { page, wrong, close } = await open(path);
   await page.getByRole("heading", { name: "Not registered" }).waitFor();
   await page.locator(".verdict").getByText("ambiguous").waitFor();
   const others = page.locator(".list button");
@@ -138,7 +130,7 @@ test("hostile names and comments are text", async () => {
   const bad = `"><img src=x onerror=alert(1)><script>alert(2)<!--&amp;\u2028'.ply`;
   const cloud = ply(bad, 2000, (i) => [Math.sin(i), Math.cos(1.7 * i), i / 1000], comment);
   upcr("view", cloud, target, "--no-open", "--out", path);
-  const { page, wrong, close } = await open(browser, path);
+  const { page, wrong, close } = await open(path);
   assert.ok((await page.locator("h1").textContent())?.includes(bad));
   assert.equal(await page.locator(".clouds details p").first().textContent(), comment);
   assert.equal(await page.locator("img, .clouds b").count(), 0);
@@ -157,7 +149,7 @@ test("shows the files' own colours, several clouds, and says what it leaves out"
   };
   const clouds = [cloud("a.xyzrgb", " 20 40 250", 0), cloud("b.xyzrgb", " 20 40 250", 2), cloud("c.xyz", "", 4)];
   upcr("view", ...clouds, "--no-open", "--out", path);
-  const { page, wrong, close } = await open(browser, path);
+  const { page, wrong, close } = await open(path);
   assert.ok(share(await pixels(page), "orange") > 0.005);
   assert.equal(await page.getByText("1 point without finite coordinates").count(), 3);
   await page.getByRole("button", { name: "The files’" }).click();
@@ -174,7 +166,7 @@ test("a script that is not the page's own does not run", async () => {
   upcr("view", source, "--no-open", "--out", path);
   const tampered = readFileSync(path, "utf8").replace("<noscript>", "<script>document.title = 'owned'</script><noscript>");
   writeFileSync(path, tampered);
-  const { page, wrong, close } = await open(browser, path);
+  const { page, wrong, close } = await open(path);
   assert.notEqual(await page.title(), "owned");
   assert.ok(wrong.some((message) => message.includes("Content Security Policy")));
   await close();
@@ -183,7 +175,7 @@ test("a script that is not the page's own does not run", async () => {
 test("without WebGL it says so, and tells all else", async () => {
   const path = join(scratch, "plain.html");
   upcr("register", source, target, "--report", path);
-  const { page, close } = await open(browser, path, {}, "HTMLCanvasElement.prototype.getContext = () => null");
+  const { page, close } = await open(path, {}, "HTMLCanvasElement.prototype.getContext = () => null");
   await page.getByText("has no WebGL").waitFor();
   await page.getByRole("heading", { name: "Registered", exact: true }).waitFor();
   await page.keyboard.press(" ");
@@ -193,7 +185,7 @@ test("without WebGL it says so, and tells all else", async () => {
 test("a lost picture is told, and comes back", async () => {
   const path = join(scratch, "lost.html");
   upcr("view", source, "--no-open", "--out", path);
-  const { page, close } = await open(browser, path);
+  const { page, close } = await open(path);
   const first = await pixels(page);
   await page.evaluate(() => {
     const extension = document.querySelector("canvas")?.getContext("webgl2")?.getExtension("WEBGL_lose_context");
@@ -212,7 +204,7 @@ test("is readable on a phone, light and dark", async () => {
   upcr("register", source, target, "--report", path);
   const images = [];
   for (const colorScheme of /** @type {const} */ (["light", "dark"])) {
-    const { page, wrong, close } = await open(browser, path, {
+    const { page, wrong, close } = await open(path, {
       viewport: { width: 360, height: 740 }, hasTouch: true, isMobile: true, colorScheme,
     });
     const wide = await page.evaluate(() => document.documentElement.scrollWidth);
@@ -240,7 +232,7 @@ test("a million points a cloud load, stay interactive, and more are thinned and 
   upcr("view", a, b, "--no-open", "--out", path);
   const start = performance.now();
   // Each frame ends with a fence, and none begins before that of the last has been passed.
-  const { page, wrong, close } = await open(browser, path, {}, `
+  const { page, wrong, close } = await open(path, {}, `
     window.times = [];
     const { fenceSync } = WebGL2RenderingContext.prototype;
     WebGL2RenderingContext.prototype.fenceSync = function (...given) {

@@ -1,12 +1,13 @@
 // A browser that records what a page does wrong, the command line, and clouds to give it.
 import { spawnSync } from "node:child_process";
-import { mkdtempSync, writeFileSync } from "node:fs";
+import { mkdtempSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import { join } from "node:path";
+import { after, before } from "node:test";
 import { fileURLToPath, pathToFileURL } from "node:url";
-import { inflateSync } from "node:zlib";
 
 import { chromium } from "playwright-core";
+import { PNG } from "pngjs";
 
 const root = fileURLToPath(new URL("../..", import.meta.url));
 export const samples = join(root, "samples");
@@ -29,6 +30,20 @@ export async function launch() {
     executablePath: process.env["CHROMIUM"] ?? "/usr/bin/chromium",
     args: ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
   });
+}
+
+/** A browser for the tests of a file, and at their end none, and no scratch folder; `open` is the one below, in it. */
+export function inBrowser() {
+  /** @type {import("playwright-core").Browser} */
+  let browser;
+  before(async () => {
+    browser = await launch();
+  });
+  after(async () => {
+    await browser.close();
+    rmSync(scratch, { recursive: true });
+  });
+  return (/** @type {string} */ path, options = {}, script = "") => open(browser, path, options, script);
 }
 
 /** Opens a page from its file, or from a server, and waits until it stands.
@@ -73,8 +88,8 @@ export async function settle(page) {
 /** Red, green, blue of each pixel of the picture, as it is on the screen.
  *  @param {import("playwright-core").Page} page */
 export async function pixels(page) {
-  const stage = page.locator("#stage");
-  return decode(await stage.screenshot());
+  const { data } = PNG.sync.read(await page.locator("#stage").screenshot());
+  return data.filter((_, i) => i % 4 !== 3);
 }
 
 /** The share of pixels that differ.
@@ -101,37 +116,6 @@ export function share(image, color) {
     if (color === "yellow" && Math.min(r, g) > b + 60) held += 1;
   }
   return held / (image.length / 3);
-}
-
-/** A PNG of 8-bit colours, as browsers write them.
- *  @param {Buffer} png */
-function decode(png) {
-  const parts = [];
-  let [width, height, channels] = [0, 0, 3];
-  for (let at = 8; at < png.length; at += 12 + png.readUInt32BE(at)) {
-    const [type, data] = [png.toString("latin1", at + 4, at + 8), png.subarray(at + 8, at + 8 + png.readUInt32BE(at))];
-    if (type === "IHDR") [width, height, channels] = [data.readUInt32BE(0), data.readUInt32BE(4), data[9] === 6 ? 4 : 3];
-    if (type === "IDAT") parts.push(data);
-  }
-  const raw = inflateSync(Buffer.concat(parts));
-  const stride = width * channels;
-  const out = new Uint8Array(3 * width * height);
-  let above = new Uint8Array(stride);
-  for (let y = 0; y < height; y += 1) {
-    const filter = raw[y * (stride + 1)];
-    const row = Uint8Array.from(raw.subarray(y * (stride + 1) + 1, (y + 1) * (stride + 1)));
-    for (let x = 0; x < stride; x += 1) {
-      const a = x >= channels ? row[x - channels] ?? 0 : 0;
-      const b = above[x] ?? 0;
-      const c = x >= channels ? above[x - channels] ?? 0 : 0;
-      const [pa, pb, pc] = [Math.abs(b - c), Math.abs(a - c), Math.abs(a + b - 2 * c)];
-      const paeth = pa <= pb && pa <= pc ? a : pb <= pc ? b : c;
-      row[x] = (row[x] ?? 0) + ([0, a, b, (a + b) >> 1, paeth][filter ?? 0] ?? 0);
-    }
-    for (let x = 0; x < width; x += 1) out.set(row.subarray(x * channels, x * channels + 3), 3 * (y * width + x));
-    above = row;
-  }
-  return out;
 }
 
 /** A binary PLY of so many points.
