@@ -8,6 +8,7 @@ mod hash;
 mod hypothesis;
 pub mod io;
 mod memory;
+pub mod multiway;
 pub mod neighbors;
 pub mod net;
 mod prepare;
