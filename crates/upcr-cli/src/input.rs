@@ -3,7 +3,7 @@
 use std::num::ParseFloatError;
 use std::path::Path;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use upcr::error::CloudRole;
 use upcr::io::{self, Intrinsics, ReadOptions};
 use upcr::{Error, PointCloud};
@@ -88,6 +88,15 @@ fn viewpoint(text: &str) -> anyhow::Result<Viewpoint> {
 
 fn numbers(text: &str) -> Result<Vec<f64>, ParseFloatError> {
     text.split(',').map(|v| v.trim().parse()).collect()
+}
+
+/// A number of bytes, such as 2000000, 512M or 2G.
+pub fn bytes(text: &str) -> anyhow::Result<u64> {
+    const UNITS: [(char, u32); 4] = [('K', 10), ('M', 20), ('G', 30), ('T', 40)];
+    let unit = UNITS.iter().find(|(unit, _)| text.ends_with([*unit, unit.to_ascii_lowercase()]));
+    let (digits, shift) = unit.map_or((text, 0), |&(_, shift)| (&text[..text.len() - 1], shift));
+    let number: u64 = digits.parse().context("a whole number, with K, M, G or T behind it, is needed")?;
+    number.checked_mul(1 << shift).context("more than there is")
 }
 
 #[cfg(test)]

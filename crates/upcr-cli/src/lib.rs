@@ -11,6 +11,7 @@ mod features;
 mod import;
 mod info;
 mod input;
+mod merge;
 mod output;
 mod pairs;
 mod register;
@@ -38,7 +39,7 @@ pub enum Status {
     Failed = 1,
     /// The command line is not understood.
     NotUnderstood = 2,
-    /// `register` ran, but found no pose to trust.
+    /// `register` found no pose to trust; `merge` left scans out.
     NotRegistered = 3,
     /// Stopped before the end, as shells have it after Ctrl-C.
     Stopped = 130,
@@ -70,6 +71,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Register(register::Args),
+    Merge(merge::Args),
     View(view::Args),
     Features(features::Args),
     Synth(synth::Args),
@@ -100,6 +102,7 @@ pub fn run(args: impl IntoIterator<Item = impl Into<OsString> + Clone>) -> Statu
     };
     let outcome = match cli.command {
         Command::Register(args) => register::run(&args),
+        Command::Merge(args) => merge::run(&args),
         Command::View(args) => view::run(&args),
         Command::Features(args) => features::run(&args),
         Command::Synth(args) => synth::run(&args),

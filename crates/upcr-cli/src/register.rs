@@ -80,7 +80,7 @@ pub struct Args {
     /// Memory that a registration may take, e.g. `512M` or `2G` (K, M, G and T are powers of 1024). Where a cloud needs more,
     /// every second, fourth, ... point of it is used. The clouds themselves, as the files' readers hold them, and the
     /// weights of `--weights` are not counted [default: no limit]
-    #[arg(long, value_name = "BYTES", value_parser = bytes)]
+    #[arg(long, value_name = "BYTES", value_parser = input::bytes)]
     max_memory: Option<u64>,
     /// Write the source, moved onto the target
     #[arg(short, long, value_name = "CLOUD")]
@@ -161,15 +161,6 @@ impl Args {
         }
         Ok(Told::WithoutTimes(value))
     }
-}
-
-/// A number of bytes, such as 2000000, 512M or 2G.
-fn bytes(text: &str) -> Result<u64> {
-    const UNITS: [(char, u32); 4] = [('K', 10), ('M', 20), ('G', 30), ('T', 40)];
-    let unit = UNITS.iter().find(|(unit, _)| text.ends_with([*unit, unit.to_ascii_lowercase()]));
-    let (digits, shift) = unit.map_or((text, 0), |&(_, shift)| (&text[..text.len() - 1], shift));
-    let number: u64 = digits.parse().context("a whole number, with K, M, G or T behind it, is needed")?;
-    number.checked_mul(1 << shift).context("more than there is")
 }
 
 pub fn run(args: &Args) -> Result<Status> {

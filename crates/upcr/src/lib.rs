@@ -25,7 +25,7 @@ pub use cloud::{PointCloud, TriangleMesh};
 pub use error::{CloudRole, Error, Result};
 pub use free_direction::FreeDirection;
 pub use refine::{Locks, Refinement, RobustKernel};
-pub use register::{register, register_watched};
+pub use register::{ReadyScan, register, register_ready, register_watched};
 pub use registration::{Alternative, Reason, Registration, TRUSTWORTHY, Timings};
 pub use settings::{Method, Settings};
 pub use transform::Rigid;

@@ -193,7 +193,7 @@ pub(crate) fn derive_voxel_size(source: &Checked, target: &Checked) -> f64 {
     a.max(b)
 }
 
-fn natural_voxel_size(checked: &Checked) -> f64 {
+pub(crate) fn natural_voxel_size(checked: &Checked) -> f64 {
     let (points, bounds) = (checked.len(), &checked.bounds);
     let floor = smallest_voxel_size(bounds.diagonal());
     if points <= FEATURE_POINTS {

@@ -1,6 +1,6 @@
 //! What a registration returns.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::{
     free_direction::FreeDirection,
@@ -10,7 +10,7 @@ use crate::{
 };
 
 /// What a caveat is about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum Reason {

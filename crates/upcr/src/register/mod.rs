@@ -2,6 +2,7 @@
 
 mod answer;
 mod candidates;
+mod ready;
 
 use std::sync::Arc;
 
@@ -24,6 +25,7 @@ use crate::{
 };
 use answer::{glanced_radius, nothing_known};
 use candidates::{Candidate, Glimpse};
+pub use ready::{ReadyScan, register_ready};
 
 /// Matched points lie this many coarse voxels apart at most under a right pose.
 const TOLERANCE_VOXELS: f32 = 1.5;
@@ -90,7 +92,8 @@ fn run_as_is(
     let start = Instant::now();
     match prepare_both(source, target, settings, call) {
         Ok(clouds) => {
-            let mut pipeline = Pipeline::new(&clouds, settings, call)?;
+            let Clouds { source, target, voxel_size, asks_network } = &clouds;
+            let mut pipeline = Pipeline::new(source, target, *voxel_size, *asks_network, settings, call)?;
             pipeline.timings.prepare = milliseconds(start);
             pipeline.best()
         }
@@ -172,6 +175,8 @@ struct Pipeline<'a> {
     lock: Option<LockedPose>,
     /// What the sensors of source and target saw.
     views: [Option<View>; 2],
+    /// Of source and target, where they are known already.
+    descriptors: Option<[&'a Descriptors; 2]>,
     matches: Vec<Match>,
     glimpses: Vec<Glimpse>,
     candidates: Vec<Candidate>,
@@ -180,8 +185,14 @@ struct Pipeline<'a> {
 }
 
 impl<'a> Pipeline<'a> {
-    fn new(clouds: &'a Clouds, settings: &'a Settings, call: &'a Call) -> Result<Self> {
-        let &Clouds { ref source, ref target, voxel_size, asks_network } = clouds;
+    fn new(
+        source: &'a Prepared,
+        target: &'a Prepared,
+        voxel_size: f64,
+        asks_network: bool,
+        settings: &'a Settings,
+        call: &'a Call,
+    ) -> Result<Self> {
         let init = settings.first_guess();
         let lock = LockedPose::new(settings.locks, &init, source.origin, target.origin);
         let init = to_local(&init, source, target);
@@ -196,6 +207,7 @@ impl<'a> Pipeline<'a> {
             init,
             lock,
             views,
+            descriptors: None,
             matches: Vec::new(),
             glimpses: Vec::new(),
             candidates: Vec::new(),
@@ -275,6 +287,9 @@ impl<'a> Pipeline<'a> {
 
     fn feature_matches(&self) -> Result<Vec<Match>> {
         let (a, b) = (self.source.coarse(), self.target.coarse());
+        if let Some([da, db]) = self.descriptors {
+            return Ok(match_levels((a, da), (b, db)));
+        }
         let feature = self.settings.feature.feature();
         let (da, db) = rayon::join(|| describe(a, feature, self.call), || describe(b, feature, self.call));
         if self.call.is_over() {
