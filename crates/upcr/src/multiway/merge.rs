@@ -31,10 +31,12 @@ const CLOSING_ROUNDS: usize = 2;
 const SAMPLE: usize = 512;
 const CELL_VOXELS: f64 = 8.0;
 const OVERLAPPING: f64 = 0.25;
+/// Probability from which on a pair is not looked at again from where the poses lay it.
+const SURE: f64 = 0.9;
 /// Scans in one cell that are looked at.
 const MOST_IN_A_CELL: usize = 48;
 /// Registrations are a little further off than their covariances know: as a share of the voxel size.
-const SYSTEMATIC_VOXELS: f64 = 0.05;
+const SYSTEMATIC_VOXELS: f64 = 0.25;
 /// Bytes of scans held at once where no bound is given.
 const DEFAULT_MEMORY: u64 = 2 << 30;
 
@@ -499,7 +501,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
         covariance
     }
 
-    /// Pairs that the poses lay on each other, and that are not joined: for each scan those that overlap it most.
+    /// Pairs that the poses lay on each other, and that are not surely known: for each scan those that overlap it most.
     fn overlapping(&self, solution: &Solution) -> BTreeSet<(usize, usize, Proposal)> {
         let edge = CELL_VOXELS * self.voxel_size;
         let mut scans_of: BTreeMap<(usize, [i64; 3]), Vec<usize>> = BTreeMap::new();
@@ -533,8 +535,8 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
         let mut of: Vec<Vec<(f64, (usize, usize))>> = vec![Vec::new(); self.surveyed.len()];
         for (&(a, b), &cells) in &shared {
             let share = cells as f64 / cells_of[a].min(cells_of[b]).max(1) as f64;
-            let joined = best.get(&(a, b)).is_some_and(|attempt| attempt.probability >= TRUSTWORTHY);
-            if share >= OVERLAPPING && !joined {
+            let sure = best.get(&(a, b)).is_some_and(|attempt| attempt.probability >= SURE);
+            if share >= OVERLAPPING && !sure {
                 of[a].push((share, (a, b)));
                 of[b].push((share, (a, b)));
             }
