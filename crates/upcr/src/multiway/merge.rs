@@ -157,6 +157,8 @@ pub struct Merged {
     pub places: Vec<Place>,
     /// All pairs that were registered, in order of their scans.
     pub pairs: Vec<JudgedAttempt>,
+    /// What the poses are the solution of: the pairs that were trusted.
+    pub graph: PoseGraph,
     /// The common voxel size.
     pub voxel_size: f64,
     /// By how much the covariances of pairs were multiplied, so that pairs agree with each other as they should.
@@ -552,7 +554,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
     }
 
     fn merged(&self, solution: &Solution) -> Merged {
-        let (_, trusted) = self.graph();
+        let (graph, trusted) = self.graph();
         let judged: BTreeMap<(usize, usize), _> = trusted.iter().copied().zip(&solution.edges).collect();
         let pairs: Vec<JudgedAttempt> = self
             .best()
@@ -592,7 +594,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
                 }
             })
             .collect();
-        Merged { places, pairs, voxel_size: self.voxel_size, inflation: solution.inflation }
+        Merged { places, pairs, graph, voxel_size: self.voxel_size, inflation: solution.inflation }
     }
 }
 
