@@ -8,6 +8,7 @@ mod calibrate;
 mod commands;
 #[cfg(feature = "train")]
 mod learning;
+mod merge;
 mod register;
 mod rerun;
 
