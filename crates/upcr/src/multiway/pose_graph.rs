@@ -3,7 +3,7 @@
 //! Each scan i has a pose X_i, `T_model_i`; each edge a measured pose Z of its source in the frame of its target. The error
 //! of an edge is the left twist that takes Z to X_j⁻¹ X_i, about a centre c of the target: ω, and where it takes c. Wrong
 //! edges are found by graduated non-convexity (Yang et al., "Graduated Non-Convexity for Robust Spatial Perception", 2020):
-//! truncated least squares, reached from a cost under which every edge counts.
+//! truncated least squares, reached from a wider cost.
 
 use std::collections::BTreeMap;
 
@@ -17,7 +17,8 @@ const CHI_SQ_MOST: f64 = 16.81;
 const CHI_SQ_QUARTILE: f64 = 3.455;
 /// Chances beyond these say no more.
 const SUREST: f64 = 0.99;
-/// Scale of the cost falls by this factor from where every edge counts.
+/// The cost's scale begins at so many times the middle error along the tree, and falls by this factor.
+const WIDELY: f64 = 4.0;
 const ANNEALING: f64 = 1.6;
 /// Steps under one scale, and to the end.
 const STEPS: usize = 2;
@@ -153,25 +154,26 @@ impl PoseGraph {
 
         let mut problem = Problem { graph: self, information: &information, free: Vec::new() };
         problem.anchor(&tree);
-        let all: Vec<f64> = vec![1.0; self.edges.len()];
         let error = |poses: &[Rigid]| -> Vec<f64> {
             (0..self.edges.len()).map(|e| problem.chi_sq(poses, e)).collect()
         };
-        // From a scale under which the worst edge counts nearly as much as the best.
-        let worst = error(&poses).iter().zip(&most).map(|(x, m)| x / m).fold(1.0, f64::max);
-        let mut scale = worst;
+        // The poses along the tree are near the right ones where most edges agree with them: from a scale under which these
+        // count, and not from one under which all do, the surest of the wrong ones cannot carry them off.
+        let mut exceeding: Vec<f64> = error(&poses).iter().zip(&most).map(|(x, m)| x / m).collect();
+        exceeding.sort_by(f64::total_cmp);
+        let mut scale = exceeding.get(exceeding.len() / 2).map_or(1.0, |middle| WIDELY * middle);
+        let agreement: Vec<f64> =
+            cycles.votes.iter().map(|[yes, no]| (yes + 1) as f64 / (yes + no + 1) as f64).collect();
         while scale > 1.0 {
             for _ in 0..STEPS {
-                let weights: Vec<f64> = error(&poses)
-                    .iter()
-                    .zip(&most)
-                    .map(|(x, m)| (scale * m / (scale * m + x)).powi(2))
+                let weights: Vec<f64> = (error(&poses).iter().zip(&most).zip(&agreement))
+                    .map(|((x, m), agreement)| agreement * (scale * m / (scale * m + x)).powi(2))
                     .collect();
                 problem.step(&mut poses, &weights);
             }
             scale /= ANNEALING;
         }
-        let mut kept = vec![true; all.len()];
+        let mut kept = vec![true; self.edges.len()];
         for round in 0..MOST_ROUNDS {
             let now: Vec<bool> = error(&poses).iter().zip(&most).map(|(x, m)| x <= m).collect();
             if round > 0 && now == kept {

@@ -151,14 +151,14 @@ pub fn alike(vectors: &[Vec<f32>], count: usize) -> Vec<Vec<(usize, f32)>> {
 mod tests {
     use super::*;
 
-    /// Features of a place: histograms about a few centres that differ from place to place.
+    /// Features of a place: histograms about centres that differ from place to place.
     fn features(place: u64, view: u64) -> Descriptors {
         let mut centers = ChaCha8Rng::seed_from_u64(place);
-        let centers: Vec<f32> = (0..6 * 33).map(|_| centers.random::<f32>().powi(4)).collect();
+        let centers: Vec<f32> = (0..40 * 33).map(|_| centers.random::<f32>().powi(4)).collect();
         let mut rng = ChaCha8Rng::seed_from_u64(1000 * place + view);
         let values = (0..300)
             .flat_map(|_| {
-                let k = rng.random_range(0..6u64) as usize;
+                let k = rng.random_range(0..40u64) as usize;
                 (0..33).map(|c| centers[33 * k + c] + 0.05 * rng.random::<f32>()).collect::<Vec<_>>()
             })
             .collect();
@@ -172,7 +172,8 @@ mod tests {
         assert_eq!(vocabulary, Vocabulary::learn(&scans, 7));
         let vectors: Vec<Vec<f32>> = scans.iter().map(|s| vocabulary.describe(s)).collect();
         for (i, others) in alike(&vectors, 3).iter().enumerate() {
-            assert!(others.iter().all(|(j, _)| j / 4 == i / 4), "{i}: {others:?}");
+            let same = others.iter().filter(|(j, _)| j / 4 == i / 4).count();
+            assert!(others[0].0 / 4 == i / 4 && same >= 2, "{i}: {others:?}");
         }
     }
 
