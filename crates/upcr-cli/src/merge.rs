@@ -123,7 +123,8 @@ pub fn run(args: &Args) -> Result<Status> {
             models[*model].push((scan, *T_model_scan));
         }
     }
-    let names: Vec<String> = files.paths.iter().map(|path| path.display().to_string()).collect();
+    let paths: Vec<&Path> = files.paths.iter().map(PathBuf::as_path).collect();
+    let names = input::short_names(&paths);
     for (number, scans) in models.iter().enumerate() {
         let told = |done: usize| step(&format!("merging: {done} of {}", scans.len()));
         let cloud = fuse(&files, scans, args.thin.unwrap_or(merged.voxel_size), &told)?;
@@ -153,6 +154,8 @@ fn found(given: &[PathBuf], output: &Path) -> Result<Vec<PathBuf>> {
                 .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
                 .with_context(|| path.display().to_string())?;
             inside.retain(|p| p.is_file() && io::format_name(p).is_some() && !is_model(p, output));
+            // Poses lie beside scans, and their four lines of numbers read as points too.
+            inside.retain(|p| io::read_transform(p).is_err());
             inside.sort();
             if inside.is_empty() {
                 bail!("{}: there is no scan in it", path.display());
