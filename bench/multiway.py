@@ -52,7 +52,7 @@ def upcr(binary: str, files: list[Path], threads: int) -> tuple[float, dict[int,
     if run.returncode not in (0, 3):
         sys.exit(run.stderr)
     told = json.loads(run.stdout)
-    number = {str(path): i for i, path in enumerate(files)}
+    number = {path.name: i for i, path in enumerate(files)}
     found = {number[scan["name"]]: np.array(scan["T_model_scan"]) for scan in told["models"][0]}
     kept = sum(pair["kept"] for pair in told["pairs"])
     return seconds, found, f"{len(told['pairs'])} pairs registered, {kept} kept"
