@@ -19,6 +19,7 @@ use upcr::{Method, PointCloud, Rigid, Settings, io};
 use upcr_lab::files::write_atomically;
 
 use crate::output::{self, Progress};
+use crate::stream::{Alignment, Layout, Streaming};
 use crate::{Status, input};
 
 /// Put many scans into one model: unordered, each in a frame of its own
@@ -58,6 +59,8 @@ pub struct Args {
     /// Threads to use; the result does not depend on it [default: all]
     #[arg(long)]
     threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    stream: Streaming,
     /// Print one JSON object instead of a summary
     #[arg(long)]
     json: bool,
@@ -99,6 +102,11 @@ pub fn run(args: &Args) -> Result<Status> {
         sequential: args.sequential,
         max_memory_bytes: args.max_memory,
     };
+    let paths: Vec<&Path> = files.paths.iter().map(PathBuf::as_path).collect();
+    let names = input::short_names(&paths);
+    let layout = Layout { clouds: true, curves: &["pairs"], words: true };
+    let stream = args.stream.open("merge", &layout)?;
+    let shown = stream.map(|stream| Alignment::new(stream, &files, &names));
     let journal = Journal::open(&args.output, &files.paths, &settings)?;
     let progress = Mutex::new(Progress::new());
     let step = |what: &str| {
@@ -113,8 +121,19 @@ pub fn run(args: &Args) -> Result<Status> {
         };
         step(&format!("{what}: {done} of {of}"));
     };
-    let pair = |attempt: &Attempt| journal.append(attempt);
-    let merged = merge(&files, &settings, &journal.known, &MergeWatch { pair: &pair, progress: &tell })?;
+    let pair = |attempt: &Attempt| {
+        if let Some(shown) = &shown {
+            shown.pair(attempt);
+        }
+        journal.append(attempt)
+    };
+    let aligned = |poses: &[Rigid]| {
+        if let Some(shown) = &shown {
+            shown.poses(poses);
+        }
+    };
+    let watch = MergeWatch { pair: &pair, progress: &tell, alignment: &aligned };
+    let merged = merge(&files, &settings, &journal.known, &watch)?;
 
     let mut models: Vec<Vec<(usize, Rigid)>> = Vec::new();
     for (scan, place) in merged.places.iter().enumerate() {
@@ -123,8 +142,6 @@ pub fn run(args: &Args) -> Result<Status> {
             models[*model].push((scan, *T_model_scan));
         }
     }
-    let paths: Vec<&Path> = files.paths.iter().map(PathBuf::as_path).collect();
-    let names = input::short_names(&paths);
     for (number, scans) in models.iter().enumerate() {
         let told = |done: usize| step(&format!("merging: {done} of {}", scans.len()));
         let cloud = fuse(&files, scans, args.thin.unwrap_or(merged.voxel_size), &told)?;
@@ -136,10 +153,14 @@ pub fn run(args: &Args) -> Result<Status> {
     journal.done()?;
     drop(progress);
     let told = told(&merged, &names, &models);
+    let summary = summary(&told, args);
+    if let Some(shown) = shown {
+        shown.end(&summary)?;
+    }
     if args.json {
         output::answer_json(&told)?;
     } else {
-        output::answer(&summary(&told, args))?;
+        output::answer(&summary)?;
     }
     let whole = models.len() == 1 && told.left_out.is_empty();
     Ok(if whole { Status::Done } else { Status::NotRegistered })

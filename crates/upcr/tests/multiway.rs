@@ -1,5 +1,7 @@
 //! Many scans into models: a landscape seen in tiles, and the Stanford bunny.
 
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic)]
+
 mod common;
 
 use std::sync::Mutex;

@@ -2,6 +2,7 @@
 
 #[cfg(not(feature = "rerun"))]
 mod absent;
+mod alignment;
 mod registration;
 #[cfg(feature = "rerun")]
 mod viewer;
@@ -17,6 +18,7 @@ use clap::{Arg, Command};
 
 #[cfg(not(feature = "rerun"))]
 pub use absent::Stream;
+pub use alignment::Alignment;
 pub use registration::Shown;
 #[cfg(feature = "rerun")]
 pub use viewer::Stream;

@@ -113,6 +113,34 @@ mod with_the_feature {
     }
 
     #[test]
+    fn rerun_file_has_the_steps_in_which_scans_come_together() {
+        let scratch = Scratch::new();
+        let [folder, model, file] = ["scans", "model.ply", "out.rrd"].map(|name| scratch.path(name));
+        let made = upcr([
+            "synth", "--scene", "object", "--scans", "5", "--size", "120x90", "--seed", "4", "--out", &folder,
+        ]);
+        assert_eq!(made.status, 0, "{}", made.stderr);
+        let run = upcr(["merge", &folder, "-o", &model, "--json", &format!("--rerun={file}")]);
+        assert!([0, 3].contains(&run.status), "{}", run.stderr);
+        let told = run.json();
+        let recording = Recording::read(&file);
+        let scans = told["models"][0].as_array().unwrap();
+        assert!(scans.len() >= 3, "{told}");
+        for scan in scans {
+            let entity = format!("/clouds/{}", scan["name"].as_str().unwrap());
+            assert!(recording.points(&entity).len() > 100);
+            let poses = recording.poses(&entity);
+            assert!(poses.len() > 3);
+            let rows = scan["T_model_scan"].as_array().unwrap().iter();
+            let expected: Vec<f64> =
+                rows.flat_map(|row| row.as_array().unwrap()).map(|v| v.as_f64().unwrap()).collect();
+            assert!(largest_difference(poses.last().unwrap(), &expected) < 1e-4);
+        }
+        assert!(recording.scalars("/pairs/probability").len() >= told["pairs"].as_array().unwrap().len());
+        assert!(recording.document("/summary").contains("model.ply"));
+    }
+
+    #[test]
     fn rerun_file_has_the_clouds_and_a_pose_for_each_iteration() {
         let scratch = Scratch::new();
         let file = scratch.path("out.rrd");

@@ -5,7 +5,6 @@
 //! again.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
 
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use rayon::prelude::*;
@@ -192,11 +191,13 @@ pub struct MergeWatch<'a> {
     pub pair: &'a (dyn Fn(&Attempt) -> Result<()> + Sync),
     /// Hears how far it is.
     pub progress: &'a (dyn Fn(MergeProgress) + Sync),
+    /// Hears the poses of all scans whenever they are aligned anew, step by step; the last ones are those of the result.
+    pub alignment: &'a (dyn Fn(&[Rigid]) + Sync),
 }
 
 impl Default for MergeWatch<'_> {
     fn default() -> Self {
-        Self { pair: &|_| Ok(()), progress: &|_| () }
+        Self { pair: &|_| Ok(()), progress: &|_| (), alignment: &|_| () }
     }
 }
 
@@ -212,7 +213,7 @@ pub fn merge(
     watch: &MergeWatch,
 ) -> Result<Merged> {
     settings.registration.check()?;
-    on_threads(settings.registration.threads, || Merge::new(scans, settings, known, watch)?.run())?
+    on_threads(settings.registration.threads, || Merge::new(scans, settings, known, watch).run())?
 }
 
 struct Merge<'a, S: ?Sized> {
@@ -222,7 +223,7 @@ struct Merge<'a, S: ?Sized> {
     voxel_size: f64,
     surveyed: Vec<Surveyed>,
     /// Scans that are ready.
-    ready: BTreeMap<usize, Arc<ReadyScan>>,
+    ready: BTreeMap<usize, ReadyScan>,
     /// How many of them there may be at once.
     capacity: usize,
     known: BTreeMap<(usize, usize, Proposal), Attempt>,
@@ -242,12 +243,7 @@ struct Surveyed {
 }
 
 impl<'a, S: Scans + ?Sized> Merge<'a, S> {
-    fn new(
-        scans: &'a S,
-        settings: &'a MergeSettings,
-        known: &[Attempt],
-        watch: &'a MergeWatch<'a>,
-    ) -> Result<Self> {
+    fn new(scans: &'a S, settings: &'a MergeSettings, known: &[Attempt], watch: &'a MergeWatch<'a>) -> Self {
         let voxel_size = match settings.registration.voxel_size {
             Some(voxel_size) => voxel_size,
             None => common_voxel_size(scans),
@@ -264,7 +260,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             attempts: BTreeMap::new(),
         };
         merge.survey();
-        Ok(merge)
+        merge
     }
 
     /// Reads every scan once.
@@ -288,7 +284,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
                 if let Ok(ready) = found {
                     let bytes = ready.bytes() as u64;
                     if held + bytes <= memory {
-                        self.ready.insert(scan, Arc::new(ready));
+                        self.ready.insert(scan, ready);
                     } else if self.capacity == self.scans.len().max(2) {
                         self.capacity = self.ready.len().max(2);
                     }
@@ -324,7 +320,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             wanted.extend(others.iter().take(neighbors).map(|&j| (i.max(j), i.min(j), Proposal::Likeness)));
         }
         self.register(wanted, None)?;
-        let mut solution = self.graph().0.solve();
+        let mut solution = self.solve();
 
         for round in 1..=JOINING_ROUNDS {
             let sizes = sizes(&solution.models);
@@ -340,14 +336,14 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             if !self.register(wanted, None)? {
                 break;
             }
-            solution = self.graph().0.solve();
+            solution = self.solve();
         }
         for _ in 0..CLOSING_ROUNDS {
             let wanted = self.overlapping(&solution);
             if !self.register(wanted, Some(&solution))? {
                 break;
             }
-            solution = self.graph().0.solve();
+            solution = self.solve();
         }
         Ok(self.merged(&solution))
     }
@@ -429,7 +425,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
         }
         let found: Vec<(usize, ReadyScan)> =
             missing.par_iter().map(|&scan| Ok((scan, self.make_ready(scan)?))).collect::<Result<_>>()?;
-        self.ready.extend(found.into_iter().map(|(scan, ready)| (scan, Arc::new(ready))));
+        self.ready.extend(found);
         Ok(())
     }
 
@@ -472,6 +468,10 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             }
         }
         best
+    }
+
+    fn solve(&self) -> Solution {
+        self.graph().0.solve_heard(self.watch.alignment)
     }
 
     /// The graph of the pairs that are trusted, and these pairs.
@@ -633,7 +633,9 @@ fn common_voxel_size(scans: &(impl Scans + ?Sized)) -> f64 {
 /// Scans in each model.
 fn sizes(models: &[usize]) -> Vec<usize> {
     let mut sizes = vec![0; models.iter().max().map_or(0, |m| m + 1)];
-    models.iter().for_each(|&m| sizes[m] += 1);
+    for &model in models {
+        sizes[model] += 1;
+    }
     sizes
 }
 

@@ -135,6 +135,11 @@ fn stepped(pose: &Rigid, center: [f64; 3], step: &Vector6<f64>) -> Rigid {
 impl PoseGraph {
     /// Finds the poses, and the edges that do not fit.
     pub fn solve(&self) -> Solution {
+        self.solve_heard(&|_| ())
+    }
+
+    /// As [`Self::solve`]; `hear` hears the poses after each step, the last time those of the solution.
+    pub fn solve_heard(&self, hear: &dyn Fn(&[Rigid])) -> Solution {
         let scans = self.centers.len();
         let cycles = self.cycles();
         let by_trust = self.by_trust(&cycles.votes);
@@ -170,6 +175,7 @@ impl PoseGraph {
                     .map(|((x, m), agreement)| agreement * (scale * m / (scale * m + x)).powi(2))
                     .collect();
                 problem.step(&mut poses, &weights);
+                hear(&poses);
             }
             scale /= ANNEALING;
         }
@@ -182,7 +188,9 @@ impl PoseGraph {
             kept = now;
             let weights: Vec<f64> = kept.iter().map(|&k| f64::from(u8::from(k))).collect();
             for _ in 0..MOST_STEPS {
-                if problem.step(&mut poses, &weights) < SETTLED {
+                let saved = problem.step(&mut poses, &weights);
+                hear(&poses);
+                if saved < SETTLED {
                     break;
                 }
             }
@@ -194,6 +202,7 @@ impl PoseGraph {
         }
         let models = forest.names();
         self.to_anchors(&mut poses, &models, &kept);
+        hear(&poses);
         let edges = (0..self.edges.len())
             .map(|e| Judged {
                 kept: kept[e],

@@ -127,7 +127,9 @@ impl Vocabulary {
 pub(super) fn normalize(vector: &mut [f32]) {
     let length = vector.iter().map(|v| v * v).sum::<f32>().sqrt();
     if length > 0.0 {
-        vector.iter_mut().for_each(|v| *v /= length);
+        for v in vector {
+            *v /= length;
+        }
     }
 }
 
