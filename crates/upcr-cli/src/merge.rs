@@ -196,10 +196,10 @@ fn found(given: &[PathBuf], output: &Path) -> Result<Vec<PathBuf>> {
 
 /// Whether a file has the name of one of the models that `output` stands for.
 fn is_model(path: &Path, output: &Path) -> bool {
-    let same_folder = path.parent().map(fs::canonicalize).and_then(Result::ok)
-        == Some(output.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new(".")))
-            .map(fs::canonicalize)
-            .and_then(Result::ok);
+    let folder = |file: &Path| {
+        let parent = file.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        fs::canonicalize(parent).ok()
+    };
     let (Some(stem), Some(model)) =
         (path.file_stem().and_then(|s| s.to_str()), output.file_stem().and_then(|s| s.to_str()))
     else {
@@ -207,7 +207,7 @@ fn is_model(path: &Path, output: &Path) -> bool {
     };
     let rest = stem.strip_prefix(model);
     let number = rest.and_then(|rest| rest.strip_prefix('_')).is_some_and(|n| n.parse::<usize>().is_ok());
-    same_folder && path.extension() == output.extension() && (rest == Some("") || number)
+    folder(path) == folder(output) && path.extension() == output.extension() && (rest == Some("") || number)
 }
 
 /// `model.ply`, `model_2.ply` and so on.
