@@ -1,9 +1,11 @@
 /** The report: a picture that can be turned, and all that is known about it beside. */
 
-import { type Coloring, type Palette, type Side, turnBetween, type Up, UPS, Viewer } from "@upcr/viewer";
+import { type Coloring, type Palette, type Side, type Up, UPS, Viewer } from "@upcr/viewer";
 
-import type { Contents, Pose } from "./contents.ts";
-import { button, choice, count, el, legible, number, section } from "./dom.ts";
+import { cloudSection } from "./clouds.ts";
+import type { Contents } from "./contents.ts";
+import { button, choice, el, number, section } from "./dom.ts";
+import { Poses } from "./poses.ts";
 import { isDark, onTheme, turnTheme } from "./theme.ts";
 import { details, figures, verdict } from "./words.ts";
 
@@ -15,9 +17,6 @@ const KEYS: readonly (readonly [string, string])[] = [
   ["0", "the pose found"], ["1 … 9", "an alternative"], ["← → ↑ ↓", "turn"], ["+ −", "zoom"], ["Home", "the whole of it"],
   ["[ ]", "smaller, larger points"], ["t", "light, dark"], ["?", "this list"],
 ];
-
-/** So many comments of a file are shown at once. */
-const FEW = 3;
 
 /** What whoever shows a report adds to it. */
 export interface Additions {
@@ -56,7 +55,6 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
   const trouble = el("p", { id: "trouble", role: "alert", hidden: true });
   const tags = el("div", { class: "tags", "aria-hidden": "true", hidden: true }, el("span", {}, "Before"), el("span", {}, "After"));
   const legend = el("figure", { id: "legend", hidden: true });
-  const notes = el("ul", { class: "notes" });
   stage.append(trouble, tags);
 
   const clouds = page.clouds.map((_, i) => contents.cloud(i));
@@ -78,7 +76,6 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
 
   // What is shown.
 
-  let chosen = 0;
   let range = page.distances?.range ?? 1;
   const registered = page.poses.length > 0;
   const announced = el("p", { class: "unseen", "aria-live": "polite" });
@@ -101,7 +98,7 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
 
   function showDistances(): void {
     if (coloring.value() === "distances") {
-      viewer?.setDistances(contents.distances(0), registered ? contents.distances(chosen + 1) : null);
+      viewer?.setDistances(contents.distances(0), registered ? contents.distances(poses.chosen + 1) : null);
     }
     viewer?.setColoring(coloring.value(), range);
     legend.hidden = coloring.value() !== "distances";
@@ -137,103 +134,13 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
   }
   onTheme(theme, gone.signal);
 
-  // Poses.
-
-  const poseTitle = el("p", { class: "quiet" });
-  const poseText = el("pre", { tabindex: 0, "aria-label": "The pose" });
-  const poseAbout = el("p", { class: "quiet" });
-  const copied = el("span", { class: "quiet", role: "status" });
-  const notation = el("select", { id: "notation", "aria-label": "Notation" });
-  const others: HTMLButtonElement[] = [];
-
-  function nameOf(index: number): string {
-    if (!page.registration) return "The pose given";
-    return index === 0 ? "The pose found" : `Alternative ${index}`;
-  }
-
-  function showNotation(): void {
-    const told = page.poses[chosen]?.notations[notation.selectedIndex];
-    poseText.textContent = legible(told?.text ?? "");
-    poseAbout.textContent = `${told?.about ?? ""} Copy gives all digits.`;
-    copied.textContent = "";
-  }
-
-  function choose(index: number): void {
-    const pose = page.poses[index];
-    if (!pose) return;
-    chosen = index;
-    others.forEach((b, i) => b.setAttribute("aria-pressed", String(i === index)));
-    poseTitle.textContent = `${nameOf(index)}: takes source coordinates to target coordinates, y = R x + t.`;
-    announced.textContent = nameOf(index);
+  const poses = new Poses(page);
+  poses.onChosen = (pose, name) => {
+    announced.textContent = name;
     viewer?.setPose(pose.T_target_source);
     if (side.value() === "before" && layout.value() === "one") side.choose("after");
     else showDistances();
-    showNotation();
-  }
-
-  async function copy(): Promise<void> {
-    const text = page.poses[chosen]?.notations[notation.selectedIndex]?.text ?? "";
-    try {
-      await navigator.clipboard.writeText(text);
-      copied.textContent = "copied";
-    } catch {
-      // Some browsers give pages from files no clipboard: the text is selected, to be copied by hand.
-      poseText.textContent = text;
-      getSelection()?.selectAllChildren(poseText);
-      copied.textContent = "selected: copy it with Ctrl+C";
-    }
-  }
-
-  function poseSection(): HTMLElement | null {
-    const [first] = page.poses;
-    if (!first) return null;
-    notation.append(...first.notations.map(({ name }) => el("option", {}, name)));
-    notation.addEventListener("change", showNotation);
-    return section("Pose", poseTitle, el("div", { class: "row" }, notation, button("Copy", () => void copy(), { id: "copy" }), copied),
-      poseText, poseAbout);
-  }
-
-  function alternatives(): HTMLElement | null {
-    if (page.poses.length < 2) return null;
-    const [found] = page.poses;
-    const about = (pose: Pose, i: number) => i === 0 || !found
-      ? "what the verdict is about"
-      : `turned by ${turnBetween(found.T_target_source, pose.T_target_source).toFixed(1)}° against it, with ${(pose.relative_score ?? 0).toFixed(3)} of its score`;
-    others.push(...page.poses.map((pose, i) => {
-      const made = button("", () => choose(i));
-      made.append(el("kbd", { "aria-hidden": "true" }, String(i)), el("span", {}, el("b", {}, nameOf(i)), el("br"), about(pose, i)));
-      return made;
-    }));
-    return section("Alternatives", el("p", { class: "quiet" }, "Other poses explain the clouds nearly as well. Choose one to see it."),
-      el("div", { class: "list", role: "group", "aria-label": "Poses" }, ...others));
-  }
-
-  // Clouds.
-
-  function cloudList(): HTMLElement {
-    return section("Clouds", el("ul", { class: "clouds" }, ...page.clouds.map((cloud, i) => {
-      const box = el("input", { type: "checkbox", checked: true });
-      box.addEventListener("change", () => viewer?.setVisible(i, box.checked));
-      const role = page.verdict || registered ? ["source", "target"][i] ?? "" : "";
-      const told = [role, `${count(cloud.points)} ${cloud.points === 1 ? "point" : "points"}`].filter((t) => t !== "").join(", ");
-      return el("li", {}, el("label", {}, box, el("span", { class: `swatch cloud-${i % 6}`, "aria-hidden": "true" }),
-        el("span", { class: "name" }, el("bdi", {}, cloud.name)), el("span", { class: "quiet" }, told)),
-        cloud.comments.length === 0 ? null : el("details", { class: "quiet", open: cloud.comments.length <= FEW },
-          el("summary", {}, "What the file says of itself"), ...cloud.comments.map((text) => el("p", {}, el("bdi", {}, text)))));
-    })), notes);
-  }
-
-  for (const cloud of page.clouds) {
-    if (cloud.shown < cloud.points - cloud.left_out) {
-      notes.append(el("li", {}, el("bdi", {}, cloud.name), `: thinned for display to ${count(cloud.shown)} of ${count(cloud.points)} points, by chance.`));
-    }
-    if (cloud.left_out > 0) {
-      notes.append(el("li", {}, el("bdi", {}, cloud.name), `: ${count(cloud.left_out)} ${cloud.left_out === 1 ? "point without finite coordinates is" : "points without finite coordinates are"} left out.`));
-    }
-  }
-  if (viewer && viewer.broughtFrom !== null) {
-    notes.append(el("li", {}, `The first two clouds lie ${number(viewer.broughtFrom)} apart; before, they are drawn nearer.`));
-  }
+  };
 
   const help = el("dialog", { id: "help", "aria-label": "Keys" },
     el("h2", {}, "Keys"),
@@ -261,7 +168,8 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
           el("h1", {}, ...(registered && source && target
             ? [el("bdi", {}, source.name), " → ", el("bdi", {}, target.name)]
             : page.clouds.flatMap((c, i) => [i > 0 ? ", " : "", el("bdi", {}, c.name)])))),
-        verdict(page), alternatives(), poseSection(), additions.beside?.(() => chosen) ?? null, cloudList(),
+        verdict(page), poses.alternatives, poses.section, additions.beside?.(() => poses.chosen) ?? null,
+        cloudSection(page, viewer?.broughtFrom ?? null, (cloud, visible) => viewer?.setVisible(cloud, visible)),
         section("Display",
           colorings.length > 1 ? el("div", { class: "field" }, el("span", {}, "Colours"), coloring.element) : null,
           el("div", { class: "field" }, el("label", { for: "size" }, "Point size"), size),
@@ -272,7 +180,7 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
   host.prepend(...shown);
 
   theme();
-  if (registered) choose(0);
+  if (registered) poses.choose(0);
   viewer?.setSide(side.value());
   showDistances();
 
@@ -318,7 +226,7 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
     }
     if (/^Arrow|^Home$/.test(event.key) && element?.closest("aside, pre")) return;
     const digit = /^[0-9]$/.test(event.key) ? Number(event.key) : null;
-    const act = digit === null ? keys[event.key] : () => choose(digit);
+    const act = digit === null ? keys[event.key] : () => poses.choose(digit);
     if (!act) return;
     event.preventDefault();
     act();
