@@ -291,7 +291,7 @@ fn told<'a>(merged: &'a Merged, names: &'a [String], models: &[Vec<(usize, Rigid
             .filter_map(|(place, name)| match place {
                 Place::Placed { .. } => None,
                 Place::Alone => Some(LeftOut { name, reason: "no pair with it is to be trusted" }),
-                Place::Unusable(reason) => Some(LeftOut { name, reason }),
+                Place::Unusable { reason } => Some(LeftOut { name, reason }),
             })
             .collect(),
         pairs: (merged.pairs.iter())

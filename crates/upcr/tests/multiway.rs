@@ -179,7 +179,7 @@ fn scans_of_no_use_are_named_and_the_rest_is_merged() {
     let found = merged(&scans, &MergeSettings::default());
     assert_poses(&scans, &found, &truth, 1.0, 0.1);
     assert!(
-        matches!(&found.places[9], Place::Unusable(reason) if reason.contains("equal")),
+        matches!(&found.places[9], Place::Unusable { reason } if reason.contains("equal")),
         "{:?}",
         found.places[9]
     );

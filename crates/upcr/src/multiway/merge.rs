@@ -119,9 +119,10 @@ pub struct Attempt {
 }
 
 /// What became of a pair.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct JudgedAttempt {
     /// The pair.
+    #[serde(flatten)]
     pub attempt: Attempt,
     /// Whether the poses rest on it.
     pub kept: bool,
@@ -130,7 +131,8 @@ pub struct JudgedAttempt {
 }
 
 /// Where a scan lies.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "state", rename_all = "snake_case")]
 pub enum Place {
     /// In a model of two scans or more.
     Placed {
@@ -145,18 +147,22 @@ pub enum Place {
     },
     /// No pair with it is to be trusted.
     Alone,
-    /// It cannot be used: why.
-    Unusable(String),
+    /// It cannot be used.
+    Unusable {
+        /// Why.
+        reason: String,
+    },
 }
 
 /// What was made of the scans.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Merged {
     /// Of each scan.
     pub places: Vec<Place>,
     /// All pairs that were registered, in order of their scans.
     pub pairs: Vec<JudgedAttempt>,
     /// What the poses are the solution of: the pairs that were trusted.
+    #[serde(skip)]
     pub graph: PoseGraph,
     /// The common voxel size.
     pub voxel_size: f64,
@@ -583,7 +589,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             .map(|(scan, surveyed)| {
                 let model = solution.models[scan];
                 match &surveyed.fault {
-                    Some(fault) => Place::Unusable(fault.clone()),
+                    Some(fault) => Place::Unusable { reason: fault.clone() },
                     None if sizes[model] < 2 => Place::Alone,
                     None => Place::Placed {
                         model: by_size.iter().position(|&m| m == model).unwrap_or(0),
