@@ -6,7 +6,7 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{BufRead, BufReader, Write as _};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 use std::time::UNIX_EPOCH;
 
 use anyhow::{Context, Result, bail};
@@ -15,7 +15,7 @@ use upcr::multiway::{
     Attempt, MergeProgress, MergeSettings, MergeStep, MergeWatch, Merged, Place, Scans, fuse, merge,
 };
 use upcr::transform::quaternion;
-use upcr::{Method, PointCloud, Rigid, Settings, io};
+use upcr::{Calibration, Method, PointCloud, Rigid, Settings, io};
 use upcr_lab::files::write_atomically;
 
 use crate::output::{self, Progress};
@@ -53,6 +53,9 @@ pub struct Args {
     /// Memory that scans may take at once, e.g. `512M` or `2G` [default: 2G]
     #[arg(long, value_name = "BYTES", value_parser = input::bytes)]
     max_memory: Option<u64>,
+    /// Weights of the evidence for and against a pose, as `upcr calibrate fit` writes them [default: those in the program]
+    #[arg(long, value_name = "FILE")]
+    calibration: Option<PathBuf>,
     /// Seed of every random choice
     #[arg(long, default_value_t = Settings::default().seed)]
     seed: u64,
@@ -94,6 +97,7 @@ pub fn run(args: &Args) -> Result<Status> {
         registration: Settings {
             method: args.method,
             voxel_size: args.voxel_size,
+            calibration: args.calibration.as_ref().map(Calibration::load).transpose()?.map(Arc::new),
             seed: args.seed,
             threads: args.threads,
             ..Settings::default()
@@ -271,6 +275,7 @@ struct ToldPair<'a> {
     source_name: &'a str,
     target_name: &'a str,
     kept: bool,
+    contradicted: bool,
     chi_sq: Option<f64>,
     #[serde(flatten)]
     attempt: &'a Attempt,
@@ -299,6 +304,7 @@ fn told<'a>(merged: &'a Merged, names: &'a [String], models: &[Vec<(usize, Rigid
                 source_name: &names[pair.attempt.source],
                 target_name: &names[pair.attempt.target],
                 kept: pair.kept,
+                contradicted: pair.contradicted,
                 chi_sq: pair.chi_sq,
                 attempt: &pair.attempt,
             })
@@ -324,20 +330,30 @@ fn summary(told: &Told, args: &Args) -> String {
     }
     let kept = told.pairs.iter().filter(|pair| pair.kept).count();
     let _ = writeln!(text, "pairs        {} registered, {kept} kept", told.pairs.len());
-    let dropped: Vec<&ToldPair> =
-        told.pairs.iter().filter(|pair| pair.chi_sq.is_some() && !pair.kept).collect();
-    if !dropped.is_empty() {
-        text.push_str("trusted as pairs, and at odds with the others:\n");
-        for pair in dropped {
-            let _ = writeln!(
-                text,
-                "  {} -> {}  probability {:.3}",
-                pair.source_name, pair.target_name, pair.attempt.probability
-            );
-        }
-    }
+    let dropped = |pair: &&ToldPair| pair.chi_sq.is_some() && !pair.kept;
+    name_pairs(&mut text, "trusted as pairs, and at odds with the others", told, dropped);
+    let contradicted = |pair: &&ToldPair| pair.contradicted;
+    name_pairs(
+        &mut text,
+        "trusted as pairs, and what they lay on each other speaks against them",
+        told,
+        contradicted,
+    );
     let _ = writeln!(text, "voxel size   {}", told.voxel_size);
     text
+}
+
+/// The pairs that are `such`, where there are any.
+fn name_pairs(text: &mut String, what: &str, told: &Told, such: impl Fn(&&ToldPair) -> bool) {
+    let pairs: Vec<&ToldPair> = told.pairs.iter().filter(such).collect();
+    if pairs.is_empty() {
+        return;
+    }
+    let _ = writeln!(text, "{what}:");
+    for pair in pairs {
+        let ToldPair { source_name, target_name, attempt, .. } = pair;
+        let _ = writeln!(text, "  {source_name} -> {target_name}  probability {:.3}", attempt.probability);
+    }
 }
 
 /// Pairs that were registered, kept on disk until the model is there: who stops a merge goes on where it was.

@@ -76,6 +76,8 @@ enum Place {
     Street,
     /// Rocky ground, driving over it
     Terrain,
+    /// A storey of furnished rooms, carrying a scanner through them; the more scans, the more rooms
+    Building,
 }
 
 #[derive(Clone, Copy, ValueEnum)]
@@ -94,6 +96,7 @@ impl Args {
             (None, Place::Room) => Scene::Room,
             (None, Place::Street) => Scene::Street,
             (None, Place::Terrain) => Scene::Terrain,
+            (None, Place::Building) => Scene::Building,
         };
         let mut settings = SynthSettings::new(scene);
         // Where the scene's own sensor is of the kind asked for, it suits the scene better than any other.

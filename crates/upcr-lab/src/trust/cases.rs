@@ -423,7 +423,7 @@ fn place_case(places: &[Place], rng: &mut impl Rng) -> Result<Case> {
 }
 
 /// The scans as a worn-out sensor gives them, and as programs pass them on: of some it is not said from where they were
-/// seen, and of others not exactly.
+/// seen, and of half the others not exactly.
 fn worn(place: &Place, scans: [&PointCloud; 2], rng: &mut impl Rng) -> [PointCloud; 2] {
     const SAID: f64 = 0.6;
     const SAID_OF_ONE: f64 = 0.8;
@@ -432,9 +432,10 @@ fn worn(place: &Place, scans: [&PointCloud; 2], rng: &mut impl Rng) -> [PointClo
         return scans.map(Clone::clone);
     }
     let said = rng.random_bool(SAID);
+    let off = if rng.random_bool(0.5) { OFF } else { 0.0 };
     scans.map(|scan| {
         let cloud = warped(scan, place.warp, rng);
-        let off = rng.random_range(0.0..OFF) * diameter(&thinned(&scan.points, 1000));
+        let off = rng.random_range(0.0..=off) * diameter(&thinned(&scan.points, 1000));
         let off = random::direction(rng) * off;
         let viewpoint = cloud.viewpoint.filter(|_| said && rng.random_bool(SAID_OF_ONE));
         PointCloud { viewpoint: viewpoint.map(|v| (Vector3::from(v) + off).into()), ..cloud }
@@ -466,20 +467,23 @@ fn warped(scan: &PointCloud, warp: f64, rng: &mut impl Rng) -> PointCloud {
 
 /// A made-up scene, scanned from places that see more or less of the same.
 fn virtual_place(rng: &mut impl Rng) -> Result<Place> {
-    let scene = match rng.random_range(0..8) {
+    let scene = match rng.random_range(0..10) {
         0..2 => Scene::Object,
         2..6 => Scene::Room,
         6 => Scene::Street,
-        _ => Scene::Terrain,
+        7 => Scene::Terrain,
+        _ => Scene::Building,
     };
     let (tolerance, warp) = match scene {
         Scene::Object | Scene::Mesh(_) => (None, 0.004),
         Scene::Room => (Some(Tolerance::INDOOR), 0.03),
+        Scene::Building => (Some(Tolerance::INDOOR), 0.002),
         Scene::Street | Scene::Terrain => (Some(Tolerance::DRIVING), 0.002),
     };
     let mut settings = SynthSettings::new(scene);
     settings.seed = rng.random();
-    settings.scans = 6;
+    // Of a building some rooms, of which most share nothing but the size of things.
+    settings.scans = if settings.scene == Scene::Building { 16 } else { 6 };
     settings.overlap = rng.random_range(0.3..0.9);
     if let Optics::DepthCamera(camera) = &mut settings.sensor.optics {
         *camera = camera.resized(320, 240);

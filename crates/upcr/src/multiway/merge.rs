@@ -1,17 +1,18 @@
 //! From scans that lie anywhere to their poses in common models.
 //!
 //! Scans that look alike are registered with each other, the poses of pairs become a graph, and the graph's poses say which
-//! other pairs overlap and are registered too. What is known of a pair is told as soon as it is known, and need not be found
-//! again.
+//! other pairs overlap and are registered too. Parts of the graph are joined only where the pairs that would come to lie on each
+//! other speak for it: one room looks like another, and a wrong pair agrees with all others between the two. What is known of a
+//! pair is told as soon as it is known, and need not be found again.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 
 use nalgebra::{Matrix3, Matrix6, Vector3};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::pose_graph::{Edge, PoseGraph, Solution};
-use super::vocabulary::{Vocabulary, alike};
+use super::pose_graph::{Edge, Joining, PoseGraph, Solution, odds};
+use super::vocabulary::{Vocabulary, alike, looks};
 use crate::{
     PointCloud, ReadyScan, Result, Settings, features::Descriptors, register_ready,
     registration::TRUSTWORTHY, settings::Method, threads::on_threads, transform::Rigid,
@@ -19,8 +20,6 @@ use crate::{
 
 /// Scans that tell the common scale.
 const SCALED: usize = 24;
-/// Features of a scan that tell what it looks like.
-const LOOKED_AT: usize = 400;
 /// Rounds in which models that nothing joins yet are looked at again.
 const JOINING_ROUNDS: usize = 3;
 /// Rounds in which scans that the poses bring together are registered.
@@ -32,6 +31,11 @@ const CELL_VOXELS: f64 = 8.0;
 const OVERLAPPING: f64 = 0.25;
 /// Probability from which on a pair is not looked at again from where the poses lay it.
 const SURE: f64 = 0.9;
+/// Pairs that are asked whether two parts may be joined, and the share by which they are to overlap.
+const WITNESSES: usize = 6;
+const WITNESSING: f64 = 0.4;
+/// Poses that differ by less, in voxels anywhere on the source, are one.
+const SAME_VOXELS: f64 = 4.0;
 /// Scans in one cell that are looked at.
 const MOST_IN_A_CELL: usize = 48;
 /// Registrations are a little further off than their covariances know: as a share of the voxel size.
@@ -93,7 +97,7 @@ pub enum Proposal {
     Sequence,
     /// They look alike.
     Likeness,
-    /// The poses found so far lay one on the other.
+    /// The poses of other pairs lay one on the other, and it was looked whether it belongs there.
     Overlap,
 }
 
@@ -106,6 +110,8 @@ pub struct Attempt {
     pub target: usize,
     /// Why these two.
     pub proposal: Proposal,
+    /// Of an overlap, where the other pairs lay it.
+    pub prior: Option<[[f64; 4]; 4]>,
     /// Takes source coordinates to target coordinates: 4×4, row after row.
     pub T_target_source: [[f64; 4]; 4],
     /// Probability that it does.
@@ -126,7 +132,9 @@ pub struct JudgedAttempt {
     pub attempt: Attempt,
     /// Whether the poses rest on it.
     pub kept: bool,
-    /// Squared error under its covariance, where it was trusted as a pair.
+    /// Whether it was trusted as a pair, and the pairs that would come to lie on each other by it speak against it.
+    pub contradicted: bool,
+    /// Squared error under its covariance, where it was trusted as a pair and is not contradicted.
     pub chi_sq: Option<f64>,
 }
 
@@ -222,18 +230,40 @@ pub fn merge(
     on_threads(settings.registration.threads, || Merge::new(scans, settings, known, watch).run())?
 }
 
+/// A pair that is to be registered.
+#[derive(Debug, Clone, Copy)]
+struct Wanted {
+    source: usize,
+    target: usize,
+    proposal: Proposal,
+    /// Where it is looked for alone.
+    prior: Option<Rigid>,
+}
+
+impl Wanted {
+    fn searched(a: usize, b: usize, proposal: Proposal) -> Self {
+        Self { source: a.max(b), target: a.min(b), proposal, prior: None }
+    }
+
+    /// As `T_b_a` has it.
+    fn laid(a: usize, b: usize, T_b_a: Rigid) -> Self {
+        let prior = Some(if a > b { T_b_a } else { T_b_a.inverse() });
+        Self { source: a.max(b), target: a.min(b), proposal: Proposal::Overlap, prior }
+    }
+}
+
 struct Merge<'a, S: ?Sized> {
     scans: &'a S,
     settings: &'a MergeSettings,
     watch: &'a MergeWatch<'a>,
     voxel_size: f64,
     surveyed: Vec<Surveyed>,
-    /// Scans that are ready.
+    /// Scans that are ready, and the bytes that they may take.
     ready: BTreeMap<usize, ReadyScan>,
-    /// How many of them there may be at once.
-    capacity: usize,
-    known: BTreeMap<(usize, usize, Proposal), Attempt>,
-    attempts: BTreeMap<(usize, usize, Proposal), Attempt>,
+    memory: usize,
+    /// By their scans, the source's number first.
+    known: BTreeMap<(usize, usize), Vec<Attempt>>,
+    attempts: BTreeMap<(usize, usize), Vec<Attempt>>,
 }
 
 /// What is kept of each scan.
@@ -242,10 +272,22 @@ struct Surveyed {
     fault: Option<String>,
     center: [f64; 3],
     radius: f64,
+    /// Bytes that it takes when it is ready.
+    bytes: usize,
     /// Some points, about the centre.
     sample: Vec<[f32; 3]>,
-    /// Some features.
-    features: Descriptors,
+    /// The cells of these.
+    cells: HashSet<[i32; 3]>,
+    /// What it looks like.
+    looks: Descriptors,
+}
+
+/// Poses, and what they are the solution of.
+struct Solved {
+    graph: PoseGraph,
+    /// Scans of each of the graph's edges.
+    pairs: Vec<(usize, usize)>,
+    solution: Solution,
 }
 
 impl<'a, S: Scans + ?Sized> Merge<'a, S> {
@@ -254,6 +296,11 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             Some(voxel_size) => voxel_size,
             None => common_voxel_size(scans),
         };
+        let mut by_scans: BTreeMap<(usize, usize), Vec<Attempt>> = BTreeMap::new();
+        for attempt in known {
+            by_scans.entry((attempt.source, attempt.target)).or_default().push(attempt.clone());
+        }
+        let memory = settings.max_memory_bytes.unwrap_or(DEFAULT_MEMORY);
         let mut merge = Self {
             scans,
             settings,
@@ -261,8 +308,8 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             voxel_size,
             surveyed: Vec::new(),
             ready: BTreeMap::new(),
-            capacity: scans.len().max(2),
-            known: known.iter().map(|a| ((a.source, a.target, a.proposal), a.clone())).collect(),
+            memory: usize::try_from(memory).unwrap_or(usize::MAX),
+            known: by_scans,
             attempts: BTreeMap::new(),
         };
         merge.survey();
@@ -271,33 +318,52 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
 
     /// Reads every scan once.
     fn survey(&mut self) {
-        let memory = self.settings.max_memory_bytes.unwrap_or(DEFAULT_MEMORY);
         let together = rayon::current_num_threads().max(1);
         let all: Vec<usize> = (0..self.scans.len()).collect();
-        let mut held = 0_u64;
+        let mut held = 0;
         for (n, some) in all.chunks(together).enumerate() {
             (self.watch.progress)(MergeProgress {
                 step: MergeStep::Describe,
                 done: n * together,
                 of: all.len(),
             });
-            let found: Vec<Result<ReadyScan>> = some.par_iter().map(|&scan| self.make_ready(scan)).collect();
+            let found: Vec<Result<(ReadyScan, Surveyed)>> =
+                some.par_iter().map(|&scan| self.surveyed(scan)).collect();
             for (&scan, found) in some.iter().zip(found) {
-                self.surveyed.push(match &found {
-                    Ok(ready) => Surveyed::of(ready),
-                    Err(error) => Surveyed::unusable(error.to_string()),
-                });
-                if let Ok(ready) = found {
-                    let bytes = ready.bytes() as u64;
-                    if held + bytes <= memory {
-                        self.ready.insert(scan, ready);
-                    } else if self.capacity == self.scans.len().max(2) {
-                        self.capacity = self.ready.len().max(2);
+                match found {
+                    Ok((ready, surveyed)) => {
+                        if held + surveyed.bytes <= self.memory {
+                            held += surveyed.bytes;
+                            self.ready.insert(scan, ready);
+                        }
+                        self.surveyed.push(surveyed);
                     }
-                    held += bytes;
+                    Err(error) => self.surveyed.push(Surveyed::unusable(error.to_string())),
                 }
             }
         }
+    }
+
+    /// Edge of the cells in which scans overlap.
+    fn cell(&self) -> f64 {
+        CELL_VOXELS * self.voxel_size
+    }
+
+    fn surveyed(&self, scan: usize) -> Result<(ReadyScan, Surveyed)> {
+        let feature = self.settings.registration.feature;
+        let cloud = self.scans.read(scan)?;
+        let ready = ReadyScan::new(&cloud, self.voxel_size, feature)?;
+        let sample = ready.sample(SAMPLE);
+        let surveyed = Surveyed {
+            fault: None,
+            center: ready.center(),
+            radius: ready.radius(),
+            bytes: ready.bytes(),
+            cells: sample.iter().map(|p| cell_of(&Vector3::from(p.map(f64::from)), self.cell())).collect(),
+            sample,
+            looks: looks(&cloud, self.voxel_size, feature)?,
+        };
+        Ok((ready, surveyed))
     }
 
     fn make_ready(&self, scan: usize) -> Result<ReadyScan> {
@@ -306,82 +372,98 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
 
     fn run(mut self) -> Result<Merged> {
         let usable = |s: &Surveyed| s.fault.is_none();
-        let features: Vec<Descriptors> = self.surveyed.iter().map(|s| s.features.clone()).collect();
-        let vocabulary = Vocabulary::learn(&features, self.settings.registration.seed);
-        let vectors: Vec<Vec<f32>> = features.par_iter().map(|f| vocabulary.describe(f)).collect();
+        let nothing = || Descriptors { dim: 0, values: Vec::new() };
+        let looks: Vec<Descriptors> =
+            self.surveyed.iter_mut().map(|s| std::mem::replace(&mut s.looks, nothing())).collect();
+        let vocabulary = Vocabulary::learn(&looks, self.settings.registration.seed);
+        let vectors: Vec<Vec<f32>> = looks.par_iter().map(|looks| vocabulary.describe(looks)).collect();
+        drop(looks);
         let neighbors = self.settings.neighbors.max(1);
         let order: Vec<Vec<usize>> = alike(&vectors, neighbors * (1 + JOINING_ROUNDS))
             .into_iter()
             .map(|others| others.into_iter().map(|(j, _)| j).filter(|&j| usable(&self.surveyed[j])).collect())
             .collect();
 
-        let mut wanted = BTreeSet::new();
+        let mut wanted = Vec::new();
         if self.settings.sequential {
             let taken: Vec<usize> = (0..self.scans.len()).filter(|&i| usable(&self.surveyed[i])).collect();
             for step in 1..=2 {
-                wanted.extend(taken.windows(step + 1).map(|w| (w[step], w[0], Proposal::Sequence)));
+                let following = taken.windows(step + 1);
+                wanted.extend(following.map(|w| Wanted::searched(w[step], w[0], Proposal::Sequence)));
             }
         }
         for (i, others) in order.iter().enumerate().filter(|(i, _)| usable(&self.surveyed[*i])) {
-            wanted.extend(others.iter().take(neighbors).map(|&j| (i.max(j), i.min(j), Proposal::Likeness)));
+            let nearest = others.iter().take(neighbors);
+            wanted.extend(nearest.map(|&j| Wanted::searched(i, j, Proposal::Likeness)));
         }
-        self.register(wanted, None)?;
-        let mut solution = self.solve();
+        self.register(wanted)?;
+        let mut solved = self.solve()?;
 
         for round in 1..=JOINING_ROUNDS {
-            let sizes = sizes(&solution.models);
+            let models = &solved.solution.models;
+            let sizes = sizes(models);
             let largest = (0..sizes.len()).max_by_key(|&m| (sizes[m], usize::MAX - m));
-            let mut wanted = BTreeSet::new();
+            let mut wanted = Vec::new();
             for (i, others) in order.iter().enumerate() {
-                if usable(&self.surveyed[i]) && Some(solution.models[i]) != largest {
-                    let apart = |&&j: &&usize| solution.models[j] != solution.models[i];
-                    let more = others.iter().take(neighbors * (1 + round)).filter(apart);
-                    wanted.extend(more.map(|&j| (i.max(j), i.min(j), Proposal::Likeness)));
+                if usable(&self.surveyed[i]) && Some(models[i]) != largest {
+                    let more =
+                        others.iter().take(neighbors * (1 + round)).filter(|&&j| models[j] != models[i]);
+                    wanted.extend(more.map(|&j| Wanted::searched(i, j, Proposal::Likeness)));
                 }
             }
-            if !self.register(wanted, None)? {
+            if !self.register(wanted)? {
                 break;
             }
-            solution = self.solve();
+            solved = self.solve()?;
         }
         for _ in 0..CLOSING_ROUNDS {
-            let wanted = self.overlapping(&solution);
-            if !self.register(wanted, Some(&solution))? {
+            let wanted = self.overlapping(&solved.solution);
+            if !self.register(wanted)? {
                 break;
             }
-            solution = self.solve();
+            solved = self.solve()?;
         }
-        Ok(self.merged(&solution))
+        Ok(self.merged(solved))
+    }
+
+    /// Whether `attempt` answers what is wanted.
+    fn answers(&self, attempt: &Attempt, wanted: &Wanted) -> bool {
+        match (&attempt.prior, &wanted.prior) {
+            (Some(told), Some(prior)) => self.same(&exactly(told), prior, wanted.source),
+            // What was looked for once is not looked for again for another reason.
+            (None, None) => true,
+            _ => false,
+        }
+    }
+
+    /// Whether two poses lay a source nearly alike.
+    fn same(&self, a: &Rigid, b: &Rigid, source: usize) -> bool {
+        let Surveyed { center, radius, .. } = &self.surveyed[source];
+        let apart = a.inverse() * *b;
+        let shift = (Vector3::from(apart.apply(*center)) - Vector3::from(*center)).norm();
+        let turn = ((apart.rotation.trace() - 1.0) / 2.0).clamp(-1.0, 1.0).acos();
+        shift + turn * radius < SAME_VOXELS * self.voxel_size
     }
 
     /// Registers the pairs that have not been yet; whether there were any.
-    fn register(
-        &mut self,
-        wanted: BTreeSet<(usize, usize, Proposal)>,
-        prior: Option<&Solution>,
-    ) -> Result<bool> {
-        let tried = |merge: &Self, &(a, b, proposal): &(usize, usize, Proposal)| {
-            // What was looked for once is not looked for again for another reason.
-            let searched = [Proposal::Sequence, Proposal::Likeness]
-                .iter()
-                .any(|&p| merge.attempts.contains_key(&(a, b, p)));
-            merge.attempts.contains_key(&(a, b, proposal)) || (proposal != Proposal::Overlap && searched)
-        };
-        let mut missing: Vec<(usize, usize, Proposal)> = Vec::new();
+    fn register(&mut self, wanted: Vec<Wanted>) -> Result<bool> {
+        let mut missing: BTreeMap<(usize, usize), Wanted> = BTreeMap::new();
         let mut any = false;
         for pair in wanted {
-            if tried(self, &pair) {
+            let scans = (pair.source, pair.target);
+            let answered = |attempts: Option<&Vec<Attempt>>| {
+                attempts.and_then(|all| all.iter().find(|a| self.answers(a, &pair)).cloned())
+            };
+            if answered(self.attempts.get(&scans)).is_some() || missing.contains_key(&scans) {
                 continue;
             }
             any = true;
-            match self.known.get(&pair) {
-                Some(attempt) => {
-                    self.attempts.insert(pair, attempt.clone());
-                }
-                None if !missing.iter().any(|m| (m.0, m.1) == (pair.0, pair.1)) => missing.push(pair),
-                None => {}
+            match answered(self.known.get(&scans)) {
+                Some(attempt) => self.attempts.entry(scans).or_default().push(attempt),
+                None => drop(missing.insert(scans, pair)),
             }
         }
+        let missing: Vec<Wanted> = missing.into_values().collect();
         let (all, mut done) = (missing.len(), 0);
         let mut rest = &missing[..];
         while !rest.is_empty() {
@@ -393,12 +475,10 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
                 (self.watch.progress)(MergeProgress { step: MergeStep::Register, done, of: all });
                 done += part.len();
                 let found: Vec<Option<Attempt>> =
-                    part.par_iter().map(|pair| self.attempt(pair, prior)).collect::<Result<_>>()?;
-                for (pair, attempt) in part.iter().zip(found) {
-                    if let Some(attempt) = attempt {
-                        (self.watch.pair)(&attempt)?;
-                        self.attempts.insert(*pair, attempt);
-                    }
+                    part.par_iter().map(|pair| self.attempt(pair)).collect::<Result<_>>()?;
+                for attempt in found.into_iter().flatten() {
+                    (self.watch.pair)(&attempt)?;
+                    self.attempts.entry((attempt.source, attempt.target)).or_default().push(attempt);
                 }
             }
         }
@@ -406,27 +486,32 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
     }
 
     /// How many of the pairs, from the first, can be registered with the scans that may be held at once.
-    fn fitting(&self, pairs: &[(usize, usize, Proposal)]) -> usize {
+    fn fitting(&self, pairs: &[Wanted]) -> usize {
         let mut needed = BTreeSet::new();
-        pairs
-            .iter()
-            .take_while(|(a, b, _)| {
-                needed.insert(*a);
-                needed.insert(*b);
-                needed.len() <= self.capacity
-            })
-            .count()
-            .max(1)
+        let mut bytes = 0;
+        let fits = |pair: &&Wanted| {
+            for scan in [pair.source, pair.target] {
+                if needed.insert(scan) {
+                    bytes += self.surveyed[scan].bytes;
+                }
+            }
+            bytes <= self.memory
+        };
+        pairs.iter().take_while(fits).count().max(1)
     }
 
     /// Makes ready what the pairs need, and lets go of what they do not where there is no room.
-    fn hold(&mut self, pairs: &[(usize, usize, Proposal)]) -> Result<()> {
-        let needed: BTreeSet<usize> = pairs.iter().flat_map(|(a, b, _)| [*a, *b]).collect();
+    fn hold(&mut self, pairs: &[Wanted]) -> Result<()> {
+        let needed: BTreeSet<usize> = pairs.iter().flat_map(|pair| [pair.source, pair.target]).collect();
         let missing: Vec<usize> =
             needed.iter().copied().filter(|scan| !self.ready.contains_key(scan)).collect();
         let spare: Vec<usize> = self.ready.keys().copied().filter(|scan| !needed.contains(scan)).collect();
-        let over = (self.ready.len() + missing.len()).saturating_sub(self.capacity);
-        for scan in spare.into_iter().take(over) {
+        let mut bytes: usize = self.ready.keys().chain(&missing).map(|&scan| self.surveyed[scan].bytes).sum();
+        for scan in spare {
+            if bytes <= self.memory {
+                break;
+            }
+            bytes -= self.surveyed[scan].bytes;
             self.ready.remove(&scan);
         }
         let found: Vec<(usize, ReadyScan)> =
@@ -435,27 +520,22 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
         Ok(())
     }
 
-    fn attempt(
-        &self,
-        &(source, target, proposal): &(usize, usize, Proposal),
-        prior: Option<&Solution>,
-    ) -> Result<Option<Attempt>> {
+    fn attempt(&self, &Wanted { source, target, proposal, prior }: &Wanted) -> Result<Option<Attempt>> {
         let (Some(a), Some(b)) = (self.ready.get(&source), self.ready.get(&target)) else { return Ok(None) };
-        let mut settings = Settings {
+        let registration = &self.settings.registration;
+        let settings = Settings {
             voxel_size: Some(self.voxel_size),
-            init: None,
+            method: if prior.is_some() { Method::Prior } else { registration.method },
+            init: prior,
             threads: None,
-            ..self.settings.registration.clone()
+            ..registration.clone()
         };
-        if let Some(solution) = prior {
-            settings.method = Method::Prior;
-            settings.init = Some(solution.poses[target].inverse() * solution.poses[source]);
-        }
         let found = register_ready(a, b, &settings)?;
         Ok(Some(Attempt {
             source,
             target,
             proposal,
+            prior: prior.map(|pose| pose.to_rows()),
             T_target_source: found.T_target_source.to_rows(),
             probability: found.probability,
             covariance: found.covariance,
@@ -466,18 +546,74 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
 
     /// The best attempt of each pair of scans.
     fn best(&self) -> BTreeMap<(usize, usize), &Attempt> {
-        let mut best: BTreeMap<(usize, usize), &Attempt> = BTreeMap::new();
-        for attempt in self.attempts.values() {
-            let held = best.entry((attempt.source, attempt.target)).or_insert(attempt);
-            if attempt.probability > held.probability {
-                *held = attempt;
-            }
-        }
-        best
+        self.attempts
+            .iter()
+            .filter_map(|(&scans, all)| {
+                let surer = |a: &&Attempt, b: &&Attempt| a.probability.total_cmp(&b.probability);
+                // Of equals the first.
+                all.iter().rev().max_by(surer).map(|attempt| (scans, attempt))
+            })
+            .collect()
     }
 
-    fn solve(&self) -> Solution {
-        self.graph().0.solve_heard(self.watch.alignment)
+    fn solve(&mut self) -> Result<Solved> {
+        let (graph, pairs) = self.graph();
+        let watch = self.watch;
+        let solution = graph.solve_asking(|joining| self.corroborated(&graph, joining), watch.alignment)?;
+        Ok(Solved { graph, pairs, solution })
+    }
+
+    /// Whether the pairs that an edge would lay on each other speak for it, all in all.
+    fn corroborated(&mut self, graph: &PoseGraph, joining: Joining) -> Result<bool> {
+        let edge = &graph.edges[joining.edge];
+        let witnesses = self.witnesses(edge, &joining);
+        self.register(witnesses.clone())?;
+        let said = |pair: &Wanted| {
+            let attempts = self.attempts.get(&(pair.source, pair.target))?;
+            let attempt = attempts.iter().find(|a| self.answers(a, pair))?;
+            let stays = self.same(&exactly(&attempt.T_target_source), &pair.prior?, pair.source);
+            Some(odds(if stays { attempt.probability } else { 0.0 }))
+        };
+        Ok(odds(edge.probability) + witnesses.iter().filter_map(said).sum::<f64>() > 0.0)
+    }
+
+    /// The pairs that an edge would lay on each other most, but for its own.
+    fn witnesses(&self, edge: &Edge, joining: &Joining) -> Vec<Wanted> {
+        let placed = |scan: usize| Vector3::from(joining.poses[scan].apply(self.surveyed[scan].center));
+        let moved = |a: usize| joining.T_target_source * joining.poses[a];
+        let [sources, targets] = joining.parts;
+        let mut found: Vec<(f64, usize, usize, Rigid)> = Vec::new();
+        for &a in sources {
+            let center = Vector3::from(moved(a).apply(self.surveyed[a].center));
+            for &b in targets {
+                let reach = self.surveyed[a].radius.min(self.surveyed[b].radius);
+                if (a, b) == (edge.source, edge.target) || (center - placed(b)).norm() > reach {
+                    continue;
+                }
+                let T_b_a = joining.poses[b].inverse() * moved(a);
+                let share = self.share(a, b, &T_b_a);
+                if share >= WITNESSING {
+                    found.push((share, a, b, T_b_a));
+                }
+            }
+        }
+        found.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+        found.into_iter().take(WITNESSES).map(|(_, a, b, T_b_a)| Wanted::laid(a, b, T_b_a)).collect()
+    }
+
+    /// Share of one of two scans that lies in cells of the other: of that of which it is more.
+    fn share(&self, a: usize, b: usize, T_b_a: &Rigid) -> f64 {
+        let inside = |from: usize, to: usize, T: &Rigid| {
+            let (from, to) = (&self.surveyed[from], &self.surveyed[to]);
+            let offset = T.apply(from.center);
+            let center = Vector3::from(offset) - Vector3::from(to.center);
+            let hits = from.sample.iter().filter(|p| {
+                let p = T.rotation * Vector3::from(p.map(f64::from)) + center;
+                to.cells.contains(&cell_of(&p, self.cell()))
+            });
+            hits.count() as f64 / from.sample.len().max(1) as f64
+        };
+        inside(a, b, T_b_a).max(inside(b, a, &T_b_a.inverse()))
     }
 
     /// The graph of the pairs that are trusted, and these pairs.
@@ -510,18 +646,17 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
     }
 
     /// Pairs that the poses lay on each other, and that are not surely known: for each scan those that overlap it most.
-    fn overlapping(&self, solution: &Solution) -> BTreeSet<(usize, usize, Proposal)> {
-        let edge = CELL_VOXELS * self.voxel_size;
-        let mut scans_of: BTreeMap<(usize, [i64; 3]), Vec<usize>> = BTreeMap::new();
+    fn overlapping(&self, solution: &Solution) -> Vec<Wanted> {
+        let mut scans_of: BTreeMap<(usize, [i32; 3]), Vec<usize>> = BTreeMap::new();
         let mut cells_of = vec![0_usize; self.surveyed.len()];
         for (scan, surveyed) in self.surveyed.iter().enumerate() {
             let center = Vector3::from(surveyed.center);
-            let cells: BTreeSet<[i64; 3]> = surveyed
+            let cells: BTreeSet<[i32; 3]> = surveyed
                 .sample
                 .iter()
                 .map(|p| {
                     let p = Vector3::from(p.map(f64::from)) + center;
-                    solution.poses[scan].apply(p.into()).map(|v| (v / edge).floor() as i64)
+                    cell_of(&solution.poses[scan].apply(p.into()).into(), self.cell())
                 })
                 .collect();
             cells_of[scan] = cells.len();
@@ -552,23 +687,26 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
         let mut wanted = BTreeSet::new();
         for mut pairs in of {
             pairs.sort_by(|x, y| y.0.total_cmp(&x.0).then(x.1.cmp(&y.1)));
-            wanted.extend(
-                pairs.into_iter().take(self.settings.neighbors).map(|(_, (a, b))| (a, b, Proposal::Overlap)),
-            );
+            wanted.extend(pairs.into_iter().take(self.settings.neighbors).map(|(_, pair)| pair));
         }
-        wanted
+        let laid =
+            |(a, b): (usize, usize)| Wanted::laid(a, b, solution.poses[b].inverse() * solution.poses[a]);
+        wanted.into_iter().map(laid).collect()
     }
 
-    fn merged(&self, solution: &Solution) -> Merged {
-        let (graph, trusted) = self.graph();
+    fn merged(&self, Solved { graph, pairs: trusted, solution }: Solved) -> Merged {
         let judged: BTreeMap<(usize, usize), _> = trusted.iter().copied().zip(&solution.edges).collect();
         let pairs: Vec<JudgedAttempt> = self
             .best()
             .into_iter()
-            .map(|(pair, attempt)| JudgedAttempt {
-                attempt: attempt.clone(),
-                kept: judged.get(&pair).is_some_and(|j| j.kept),
-                chi_sq: judged.get(&pair).map(|j| j.chi_sq),
+            .map(|(pair, attempt)| {
+                let judged = judged.get(&pair);
+                JudgedAttempt {
+                    attempt: attempt.clone(),
+                    kept: judged.is_some_and(|j| j.kept),
+                    contradicted: judged.is_some_and(|j| j.contradicted),
+                    chi_sq: judged.and_then(|j| j.chi_sq),
+                }
             })
             .collect();
         let mut wrong = vec![1.0; self.surveyed.len()];
@@ -605,23 +743,22 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
 }
 
 impl Surveyed {
-    fn of(ready: &ReadyScan) -> Self {
-        let (_, all) = ready.features();
-        let step = all.len().div_ceil(LOOKED_AT).max(1);
-        let values = (0..all.len()).step_by(step).flat_map(|i| all.row(i)).copied().collect();
+    fn unusable(fault: String) -> Self {
         Self {
-            fault: None,
-            center: ready.center(),
-            radius: ready.radius(),
-            sample: ready.sample(SAMPLE),
-            features: Descriptors { dim: all.dim, values },
+            fault: Some(fault),
+            center: [0.0; 3],
+            radius: 0.0,
+            bytes: 0,
+            sample: Vec::new(),
+            cells: HashSet::new(),
+            looks: Descriptors { dim: 0, values: Vec::new() },
         }
     }
+}
 
-    fn unusable(fault: String) -> Self {
-        let features = Descriptors { dim: 0, values: Vec::new() };
-        Self { fault: Some(fault), center: [0.0; 3], radius: 0.0, sample: Vec::new(), features }
-    }
+/// The cube of edge `cell` about the origin's grid in which a place is.
+fn cell_of(place: &Vector3<f64>, cell: f64) -> [i32; 3] {
+    std::array::from_fn(|k| (place[k] / cell).floor() as i32)
 }
 
 /// The middle one of the scales of some scans; zero where none has one.

@@ -11,5 +11,5 @@ pub use merge::{
     Attempt, JudgedAttempt, MergeProgress, MergeSettings, MergeStep, MergeWatch, Merged, Place, Proposal,
     Scans, merge,
 };
-pub use pose_graph::{Edge, Judged, PoseGraph, Solution};
-pub use vocabulary::{Vocabulary, alike};
+pub use pose_graph::{Edge, Joining, Judged, PoseGraph, Solution};
+pub use vocabulary::{Vocabulary, alike, looks};

@@ -71,12 +71,27 @@ pub struct Solution {
 pub struct Judged {
     /// Whether it was kept.
     pub kept: bool,
-    /// Squared error under its inflated covariance.
-    pub chi_sq: f64,
+    /// Whether it would have joined parts that other pairs speak against joining so: see [`Joining`].
+    pub contradicted: bool,
+    /// Squared error under its inflated covariance; `None` where its scans are not of one model.
+    pub chi_sq: Option<f64>,
     /// Triangles of edges about which it agrees with two others, and does not.
     pub agreeing: usize,
     /// See `agreeing`.
     pub disagreeing: usize,
+}
+
+/// An edge that is about to join two parts, each of scans whose poses are known in a frame of its own.
+#[derive(Debug)]
+pub struct Joining<'a> {
+    /// The edge, by its number.
+    pub edge: usize,
+    /// The scans of its source's part and of its target's.
+    pub parts: [&'a [usize]; 2],
+    /// Of each scan, in the frame of its part.
+    pub poses: &'a [Rigid],
+    /// Takes the frame of the source's part to that of the target's, if the edge is right.
+    pub T_target_source: Rigid,
 }
 
 impl Edge {
@@ -135,21 +150,60 @@ fn stepped(pose: &Rigid, center: [f64; 3], step: &Vector6<f64>) -> Rigid {
 impl PoseGraph {
     /// Finds the poses, and the edges that do not fit.
     pub fn solve(&self) -> Solution {
-        self.solve_heard(&|_| ())
+        let parts = self.grown(|_| true);
+        self.solved(parts, &|_| ())
     }
 
-    /// As [`Self::solve`]; `hear` hears the poses after each step, the last time those of the solution.
-    pub fn solve_heard(&self, hear: &dyn Fn(&[Rigid])) -> Solution {
-        let scans = self.centers.len();
+    /// As [`Self::solve`]. `joins` says of each edge that would join two parts whether it may, after all that is known of their
+    /// scans: parts that are not joined become models of their own. `hear` hears the poses after each step, the last time those
+    /// of the solution.
+    ///
+    /// # Errors
+    /// Those of `joins`.
+    pub fn solve_asking<E>(
+        &self,
+        mut joins: impl FnMut(Joining) -> Result<bool, E>,
+        hear: &dyn Fn(&[Rigid]),
+    ) -> Result<Solution, E> {
+        let mut failed = None;
+        let parts = self.grown(|joining| {
+            failed.is_none()
+                && joins(joining).unwrap_or_else(|error| {
+                    failed = Some(error);
+                    false
+                })
+        });
+        match failed {
+            Some(error) => Err(error),
+            None => Ok(self.solved(parts, hear)),
+        }
+    }
+
+    /// Parts along the most trusted edges.
+    fn grown(&self, mut joins: impl FnMut(Joining) -> bool) -> Grown {
         let cycles = self.cycles();
-        let by_trust = self.by_trust(&cycles.votes);
-        let mut forest = Forest::new(scans);
-        let tree: Vec<usize> = by_trust
-            .iter()
-            .copied()
-            .filter(|&e| forest.join(self.edges[e].source, self.edges[e].target))
-            .collect();
-        let mut poses = self.along(&tree);
+        let mut parts = Parts::new(self.centers.len());
+        for e in self.by_trust(&cycles.votes) {
+            let edge = &self.edges[e];
+            let [source, target] = [edge.source, edge.target].map(|scan| parts.of[scan]);
+            if source == target {
+                continue;
+            }
+            let T_target_source =
+                parts.poses[edge.target] * edge.T_target_source * parts.poses[edge.source].inverse();
+            let members = [source, target].map(|part| parts.members[part].as_slice());
+            if joins(Joining { edge: e, parts: members, poses: &parts.poses, T_target_source }) {
+                parts.join(source, target, &T_target_source);
+            }
+        }
+        Grown { parts, cycles }
+    }
+
+    fn solved(&self, Grown { parts, cycles }: Grown, hear: &dyn Fn(&[Rigid])) -> Solution {
+        let scans = self.centers.len();
+        let within: Vec<bool> =
+            self.edges.iter().map(|edge| parts.of[edge.source] == parts.of[edge.target]).collect();
+        let mut poses = parts.poses.clone();
         let information: Vec<Matrix6<f64>> = self
             .edges
             .iter()
@@ -158,17 +212,22 @@ impl PoseGraph {
         let most: Vec<f64> = self.edges.iter().map(|e| CHI_SQ_MOST + 2.0 * odds(e.probability)).collect();
 
         let mut problem = Problem { graph: self, information: &information, free: Vec::new() };
-        problem.anchor(&tree);
+        problem.anchor(&parts);
         let error = |poses: &[Rigid]| -> Vec<f64> {
             (0..self.edges.len()).map(|e| problem.chi_sq(poses, e)).collect()
         };
         // The poses along the tree are near the right ones where most edges agree with them: from a scale under which these
         // count, and not from one under which all do, the surest of the wrong ones cannot carry them off.
-        let mut exceeding: Vec<f64> = error(&poses).iter().zip(&most).map(|(x, m)| x / m).collect();
+        let ratios = error(&poses).into_iter().zip(&most).map(|(x, m)| x / m);
+        let mut exceeding: Vec<f64> =
+            ratios.zip(&within).filter(|(_, within)| **within).map(|(x, _)| x).collect();
         exceeding.sort_by(f64::total_cmp);
         let mut scale = exceeding.get(exceeding.len() / 2).map_or(1.0, |middle| WIDELY * middle);
-        let agreement: Vec<f64> =
-            cycles.votes.iter().map(|[yes, no]| (yes + 1) as f64 / (yes + no + 1) as f64).collect();
+        let agreement: Vec<f64> = (cycles.votes.iter().zip(&within))
+            .map(|([yes, no], within)| {
+                f64::from(u8::from(*within)) * (yes + 1) as f64 / (yes + no + 1) as f64
+            })
+            .collect();
         while scale > 1.0 {
             for _ in 0..STEPS {
                 let weights: Vec<f64> = (error(&poses).iter().zip(&most).zip(&agreement))
@@ -179,9 +238,11 @@ impl PoseGraph {
             }
             scale /= ANNEALING;
         }
-        let mut kept = vec![true; self.edges.len()];
+        let mut kept = within.clone();
         for round in 0..MOST_ROUNDS {
-            let now: Vec<bool> = error(&poses).iter().zip(&most).map(|(x, m)| x <= m).collect();
+            let now: Vec<bool> = (error(&poses).iter().zip(&most).zip(&within))
+                .map(|((x, m), within)| *within && x <= m)
+                .collect();
             if round > 0 && now == kept {
                 break;
             }
@@ -206,7 +267,8 @@ impl PoseGraph {
         let edges = (0..self.edges.len())
             .map(|e| Judged {
                 kept: kept[e],
-                chi_sq: chi_sq[e],
+                contradicted: !within[e],
+                chi_sq: within[e].then_some(chi_sq[e]),
                 agreeing: cycles.votes[e][0],
                 disagreeing: cycles.votes[e][1],
             })
@@ -297,40 +359,51 @@ impl PoseGraph {
         order.sort_by(|&a, &b| trust(b).total_cmp(&trust(a)).then(a.cmp(&b)));
         order
     }
-
-    /// Poses along the edges of a forest, the first scan of each tree at rest.
-    fn along(&self, tree: &[usize]) -> Vec<Rigid> {
-        let mut met: Vec<Vec<usize>> = vec![Vec::new(); self.centers.len()];
-        for &e in tree {
-            met[self.edges[e].source].push(e);
-            met[self.edges[e].target].push(e);
-        }
-        let mut poses = vec![None; self.centers.len()];
-        for root in 0..poses.len() {
-            let mut next = vec![(root, Rigid::identity())];
-            while let Some((scan, pose)) = next.pop() {
-                if poses[scan].is_some() {
-                    continue;
-                }
-                poses[scan] = Some(pose);
-                for &e in &met[scan] {
-                    let edge = &self.edges[e];
-                    if edge.target == scan {
-                        next.push((edge.source, pose * edge.T_target_source));
-                    } else {
-                        next.push((edge.target, pose * edge.T_target_source.inverse()));
-                    }
-                }
-            }
-        }
-        poses.into_iter().map(|pose| pose.unwrap_or_else(Rigid::identity)).collect()
-    }
 }
 
 /// Logarithm of the odds of a probability.
-fn odds(probability: f64) -> f64 {
+pub(super) fn odds(probability: f64) -> f64 {
     let p = probability.clamp(1.0 - SUREST, SUREST);
     (p / (1.0 - p)).ln()
+}
+
+/// Parts that edges join, and what triangles say of the edges.
+struct Grown {
+    parts: Parts,
+    cycles: Cycles,
+}
+
+/// Scans whose poses are known in common frames.
+struct Parts {
+    /// The part of each scan, and the scans of each part.
+    of: Vec<usize>,
+    members: Vec<Vec<usize>>,
+    /// Of each scan, in its part's frame.
+    poses: Vec<Rigid>,
+}
+
+impl Parts {
+    fn new(scans: usize) -> Self {
+        Self {
+            of: (0..scans).collect(),
+            members: (0..scans).map(|scan| vec![scan]).collect(),
+            poses: vec![Rigid::identity(); scans],
+        }
+    }
+
+    /// Puts the smaller part into the frame of the larger one.
+    fn join(&mut self, source: usize, target: usize, T_target_source: &Rigid) {
+        let (from, into, T) = if self.members[source].len() <= self.members[target].len() {
+            (source, target, *T_target_source)
+        } else {
+            (target, source, T_target_source.inverse())
+        };
+        for scan in std::mem::take(&mut self.members[from]) {
+            self.of[scan] = into;
+            self.poses[scan] = T * self.poses[scan];
+            self.members[into].push(scan);
+        }
+    }
 }
 
 struct Cycles {
@@ -348,17 +421,13 @@ struct Problem<'a> {
 }
 
 impl Problem<'_> {
-    /// Holds the first scan of each tree.
-    fn anchor(&mut self, tree: &[usize]) {
-        let mut forest = Forest::new(self.graph.centers.len());
-        for &e in tree {
-            forest.join(self.graph.edges[e].source, self.graph.edges[e].target);
-        }
+    /// Holds the first scan of each part.
+    fn anchor(&mut self, parts: &Parts) {
         let mut count = 0;
         let mut seen = std::collections::BTreeSet::new();
         self.free = (0..self.graph.centers.len())
             .map(|scan| {
-                if seen.insert(forest.root(scan)) {
+                if seen.insert(parts.of[scan]) {
                     return None;
                 }
                 count += 1;
@@ -657,5 +726,45 @@ mod tests {
         assert_eq!(solution.models, [0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1, 2]);
         assert_eq!(solution.poses[11], Rigid::identity());
         assert_eq!(PoseGraph::default().solve().poses, []);
+    }
+
+    #[test]
+    fn parts_are_joined_only_by_edges_that_may() {
+        // Two rings, and two edges between them that agree with each other.
+        let (mut graph, mut truth) = ring(6, 2, 0.0, 4);
+        let (other, there) = ring(5, 2, 0.0, 5);
+        graph.centers.extend(&other.centers);
+        truth.extend(&there);
+        let moved = other.edges.into_iter().map(|e| Edge { source: e.source + 6, target: e.target + 6, ..e });
+        graph.edges.extend(moved);
+        for (source, target) in [(6, 0), (7, 1)] {
+            let T_target_source = truth[target].inverse() * truth[source];
+            graph.edges.push(Edge { source, target, T_target_source, ..graph.edges[0].clone() });
+        }
+        let between = graph.edges.len() - 2;
+        let mut asked = 0;
+        let mut ask = |joining: Joining, may: bool| {
+            let edge = &graph.edges[joining.edge];
+            let [sources, targets] = joining.parts;
+            assert!(sources.contains(&edge.source) && targets.contains(&edge.target));
+            // The frames of the parts are such that the edge's own pose comes out.
+            let laid = joining.T_target_source * joining.poses[edge.source];
+            let told = joining.poses[edge.target] * edge.T_target_source;
+            assert!((laid.translation - told.translation).norm() < 1e-9);
+            asked += 1;
+            Ok::<bool, ()>(may || joining.edge < between)
+        };
+        let apart = graph.solve_asking(|joining| ask(joining, false), &|_| ()).unwrap();
+        assert_eq!(apart.models, [0, 0, 0, 0, 0, 0, 1, 1, 1, 1, 1]);
+        for (e, edge) in apart.edges.iter().enumerate() {
+            assert_eq!((edge.kept, edge.contradicted), (e < between, e >= between));
+            assert_eq!(edge.chi_sq.is_none(), edge.contradicted);
+        }
+        let joined = graph.solve_asking(|joining| ask(joining, true), &|_| ()).unwrap();
+        assert_eq!(joined, graph.solve());
+        assert_eq!(joined.models, [0; 11]);
+        // Each edge of the two trees is asked for, and of those between them every one that is refused.
+        assert_eq!(asked, (5 + 4 + 2) + (5 + 4 + 1));
+        assert_eq!(graph.solve_asking(|_| Err("full"), &|_| ()), Err("full"));
     }
 }

@@ -7,8 +7,13 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
-use crate::features::Descriptors;
+use crate::{PointCloud, ReadyScan, Result, features::Descriptors, features::MatchedFeature};
 
+/// Scans are looked at more coarsely than they are registered, by this factor: what tells places apart is larger than what holds
+/// a pose.
+const COARSER: f64 = 3.0;
+/// Features of a scan that tell what it looks like.
+const LOOKED_AT: usize = 400;
 /// Words of the vocabulary, rounds in which it is learned, and features that it is learned from at most.
 const WORDS: usize = 64;
 const ROUNDS: usize = 12;
@@ -47,6 +52,18 @@ fn nearest(words: &[f32], row: &[f32]) -> usize {
         }
     }
     best.1
+}
+
+/// Features that tell what a scan looks like which is registered at `voxel_size`.
+///
+/// # Errors
+/// As [`ReadyScan::new`].
+pub fn looks(cloud: &PointCloud, voxel_size: f64, feature: MatchedFeature) -> Result<Descriptors> {
+    let coarse = ReadyScan::new(cloud, COARSER * voxel_size, feature)?;
+    let (_, all) = coarse.features();
+    let step = all.len().div_ceil(LOOKED_AT).max(1);
+    let values = (0..all.len()).step_by(step).flat_map(|i| all.row(i)).copied().collect();
+    Ok(Descriptors { dim: all.dim, values })
 }
 
 impl Vocabulary {

@@ -115,6 +115,8 @@ pub fn register_ready(source: &ReadyScan, target: &ReadyScan, settings: &Setting
     let mut pipeline =
         Pipeline::new(&source.prepared, &target.prepared, source.voxel_size, asks_network, settings, &call)?;
     pipeline.descriptors = Some([&source.descriptors, &target.descriptors]);
+    // They are there at little cost, and speak for or against a given pose too.
+    pipeline.matches = pipeline.feature_matches()?;
     let mut found = pipeline.best()?;
     found.timings_ms.total = milliseconds(start);
     Ok(found)

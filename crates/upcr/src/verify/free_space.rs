@@ -16,7 +16,7 @@ const RAYS: usize = 8;
 const WIDTH_VOXELS: f32 = 2.0;
 /// A point in free space is so many voxels away from every other, and nearer than the surfaces behind it by as much and by
 /// this share of their range, with which a sensor's errors grow.
-const CLEAR_VOXELS: f32 = 4.0;
+const CLEAR_VOXELS: f32 = 2.0;
 const CLEAR: f32 = 0.05;
 /// More rays tell nothing new.
 const MOST_RAYS: usize = 16_384;

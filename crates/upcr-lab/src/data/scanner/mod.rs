@@ -9,6 +9,7 @@ mod path;
 pub mod scenes;
 mod sensor;
 
+use std::borrow::Cow;
 use std::f64::consts::TAU;
 
 use nalgebra::Vector3;
@@ -19,7 +20,7 @@ pub use bvh::{Bvh, Hit};
 pub use sensor::{DepthCamera, Lidar, Optics, RangeNoise, Sensor};
 
 use crate::random;
-use path::{Course, Path};
+use path::{Course, Path, Ring, Walk};
 use scenes::{LANE_M, ROOM_SIZE_M, STREET_LENGTH_M, TERRAIN_SIZE_M};
 use sensor::invalid;
 
@@ -27,6 +28,8 @@ use sensor::invalid;
 const ORBIT_RADII: f64 = 2.5;
 /// Height of a sensor carried through a room.
 const HAND_HEIGHT_M: f64 = 1.55;
+/// Scans for each room of a building.
+const SCANS_A_ROOM: usize = 4;
 /// Height of a sensor on a vehicle over the ground.
 const ROOF_HEIGHT_M: f64 = 1.9;
 
@@ -41,6 +44,8 @@ pub enum Scene {
     Street,
     /// Rocky ground of 50 × 50 m, driving over it.
     Terrain,
+    /// One storey of furnished rooms, carrying a scanner through them; the more scans, the more rooms.
+    Building,
     /// A mesh in its own unit, from all around; z is taken for up.
     Mesh(TriangleMesh),
 }
@@ -93,6 +98,7 @@ impl SynthSettings {
             Scene::Room => Sensor::HAND_HELD,
             Scene::Street => Sensor::ON_VEHICLE,
             Scene::Terrain => Sensor { range_m: [0.5, 40.0], ..Sensor::ON_VEHICLE },
+            Scene::Building => Sensor::ON_TRIPOD,
         };
         Self { scene, sensor, scans: 2, overlap: 0.6, turned: false, seed: 0 }
     }
@@ -142,6 +148,20 @@ impl Sensor {
         },
     };
 
+    /// A scanner on a tripod, for buildings.
+    pub const ON_TRIPOD: Self = Self {
+        optics: Optics::Lidar(Lidar { beams: 96, azimuth_steps: 360, elevation_deg: [-60.0, 60.0] }),
+        range_m: [0.4, 25.0],
+        noise: RangeNoise {
+            constant_m: 0.002,
+            linear: 0.0002,
+            quadratic_per_m: 0.0,
+            dropout: 0.005,
+            grazing_deg: 85.0,
+            quantum_m: 0.0,
+        },
+    };
+
     /// A close-range camera for something of the given bounding sphere, its noise a 500th of the radius.
     fn around(sphere: Sphere) -> Self {
         let noise = RangeNoise {
@@ -180,29 +200,18 @@ impl Sphere {
 /// Where a setting is out of range, the mesh is not usable, or a scan meets nothing.
 pub fn synth(settings: &SynthSettings) -> Result<Vec<Scan>> {
     settings.check()?;
-    let built;
-    let mesh = match &settings.scene {
-        Scene::Mesh(mesh) => mesh,
-        scene => {
-            built = match scene {
-                Scene::Room => scenes::room(settings.seed),
-                Scene::Street => scenes::street(settings.seed),
-                Scene::Terrain => scenes::terrain(settings.seed),
-                Scene::Object | Scene::Mesh(_) => scenes::object(settings.seed),
-            };
-            &built
-        }
-    };
-    let bvh = Bvh::new(mesh)?;
+    let (mesh, path) = place(settings);
+    let bvh = Bvh::new(&mesh)?;
     let sensor = &settings.sensor;
-    let poses = path(settings, mesh).poses(settings.scans, settings.overlap, sensor, &bvh);
+    let poses = path.poses(settings.scans, settings.overlap, sensor, &bvh);
+    let seen: Vec<_> = poses.iter().map(|pose| cast::seen(&bvh, sensor, pose)).collect();
     let mut turns = stream(settings.seed, Stream::Turn);
     let mut noise_seeds = stream(settings.seed, Stream::Noise);
     let scan = |(k, pose): (usize, &Rigid)| {
         let overlaps = poses
             .iter()
             .enumerate()
-            .map(|(other, second)| if other == k { 1.0 } else { cast::overlap(&bvh, sensor, pose, second) });
+            .map(|(other, second)| if other == k { 1.0 } else { seen[k].share(&bvh, sensor, second) });
         let overlaps = overlaps.collect();
         let points = cast::scan(&bvh, sensor, pose, noise_seeds.random());
         if points.is_empty() {
@@ -228,22 +237,40 @@ fn stream(seed: u64, purpose: Stream) -> impl Rng {
     random::stream(seed, 1 + purpose as u64)
 }
 
-/// The way the sensor takes through a scene.
-fn path(settings: &SynthSettings, mesh: &TriangleMesh) -> Path {
-    let phase = stream(settings.seed, Stream::Path).random_range(0.0..TAU);
-    let level = |half_axes, height, course| Path { center: Vector3::z() * height, half_axes, phase, course };
+/// A scene, and the way the sensor takes through it.
+fn place(settings: &SynthSettings) -> (Cow<'_, TriangleMesh>, Path) {
+    let seed = settings.seed;
+    let phase = stream(seed, Stream::Path).random_range(0.0..TAU);
+    let orbit = |mesh: &TriangleMesh| {
+        let Sphere { center, radius } = Sphere::bounding(&mesh.vertices);
+        Path::Ring(Ring { center, half_axes: [ORBIT_RADII * radius; 2], phase, course: Course::Orbit })
+    };
+    let level = |half_axes, height, course| {
+        Path::Ring(Ring { center: Vector3::z() * height, half_axes, phase, course })
+    };
     match &settings.scene {
-        Scene::Object | Scene::Mesh(_) => {
-            let Sphere { center, radius } = Sphere::bounding(&mesh.vertices);
-            Path { center, half_axes: [ORBIT_RADII * radius; 2], phase, course: Course::Orbit }
+        Scene::Mesh(mesh) => (Cow::Borrowed(mesh), orbit(mesh)),
+        Scene::Object => {
+            let object = scenes::object(seed);
+            let path = orbit(&object);
+            (Cow::Owned(object), path)
         }
         Scene::Room => {
             let [length, width, _] = ROOM_SIZE_M;
-            level([0.27 * length, 0.25 * width], HAND_HEIGHT_M, Course::Across)
+            let path = level([0.27 * length, 0.25 * width], HAND_HEIGHT_M, Course::Across);
+            (Cow::Owned(scenes::room(seed)), path)
         }
-        Scene::Street => level([0.4 * STREET_LENGTH_M, LANE_M], ROOF_HEIGHT_M, Course::Along),
+        Scene::Street => {
+            let path = level([0.4 * STREET_LENGTH_M, LANE_M], ROOF_HEIGHT_M, Course::Along);
+            (Cow::Owned(scenes::street(seed)), path)
+        }
         Scene::Terrain => {
-            level([0.32 * TERRAIN_SIZE_M, 0.22 * TERRAIN_SIZE_M], 0.0, Course::OverGround(ROOF_HEIGHT_M))
+            let half_axes = [0.32 * TERRAIN_SIZE_M, 0.22 * TERRAIN_SIZE_M];
+            (Cow::Owned(scenes::terrain(seed)), level(half_axes, 0.0, Course::OverGround(ROOF_HEIGHT_M)))
+        }
+        Scene::Building => {
+            let building = scenes::building(seed, settings.scans.div_ceil(SCANS_A_ROOM));
+            (Cow::Owned(building.mesh), Path::Walk(Walk::new(building.tour, HAND_HEIGHT_M)))
         }
     }
 }
@@ -265,11 +292,12 @@ mod tests {
     #[test]
     fn scans_laid_into_the_world_lie_on_the_scene_and_on_each_other() {
         type Build = fn(u64) -> TriangleMesh;
-        let scenes: [(Scene, Build); 4] = [
+        let scenes: [(Scene, Build); 5] = [
             (Scene::Object, scenes::object),
             (Scene::Room, scenes::room),
             (Scene::Street, scenes::street),
             (Scene::Terrain, scenes::terrain),
+            (Scene::Building, |seed| scenes::building(seed, 1).mesh),
         ];
         for (scene, build) in scenes {
             let mut settings = small(scene);

@@ -1,6 +1,8 @@
 //! Where the sensor stands: closed paths around, through and along the scenes.
+//!
+//! `s` is where on a path: an angle in rad of a [`Ring`], a length of a [`Walk`].
 
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::PI;
 
 use nalgebra::Vector3;
 use upcr::Rigid;
@@ -12,9 +14,16 @@ const STRIDES: usize = 24;
 /// Halvings of the interval the wanted overlap lies in.
 const BISECTIONS: usize = 6;
 
+/// A way that the sensor takes, again and again.
+#[derive(Debug, Clone)]
+pub(super) enum Path {
+    Ring(Ring),
+    Walk(Walk),
+}
+
 /// An ellipse the sensor goes around, counter-clockwise seen from above.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Path {
+pub(super) struct Ring {
     /// Middle of the ellipse.
     pub(super) center: Vector3<f64>,
     /// Half axes along x and y.
@@ -38,8 +47,40 @@ pub(super) enum Course {
     OverGround(f64),
 }
 
-impl Path {
-    /// Pose `T_world_sensor` at the angle `s` in rad along the path.
+/// From corner to corner, at a height, looking ahead.
+#[derive(Debug, Clone)]
+pub(super) struct Walk {
+    corners: Vec<Vector3<f64>>,
+    /// Length of the way to each corner, and back to the first at the end.
+    lengths: Vec<f64>,
+    height: f64,
+}
+
+/// Longest step of a walk, in metres.
+const STRIDE_M: f64 = 6.0;
+
+impl Walk {
+    pub(super) fn new(corners: Vec<Vector3<f64>>, height: f64) -> Self {
+        let mut length = 0.0;
+        let mut lengths = vec![0.0];
+        for (i, corner) in corners.iter().enumerate() {
+            length += (corners[(i + 1) % corners.len()] - corner).norm();
+            lengths.push(length);
+        }
+        Self { corners, lengths, height }
+    }
+
+    fn pose(&self, s: f64, sensor: &Sensor) -> Rigid {
+        let whole = self.lengths[self.corners.len()].max(f64::MIN_POSITIVE);
+        let s = s.rem_euclid(whole);
+        let leg = self.lengths.partition_point(|&length| length <= s).clamp(1, self.corners.len()) - 1;
+        let [from, to] = [leg, leg + 1].map(|i| self.corners[i % self.corners.len()]);
+        let ahead = (to - from).try_normalize(0.0).unwrap_or_else(Vector3::x);
+        sensor.pose(from + ahead * (s - self.lengths[leg]) + Vector3::z() * self.height, ahead)
+    }
+}
+
+impl Ring {
     fn pose(&self, s: f64, sensor: &Sensor, scene: &Bvh) -> Rigid {
         let (sin, cos) = (s + self.phase).sin_cos();
         let [a, b] = self.half_axes;
@@ -65,6 +106,16 @@ impl Path {
             }
         }
     }
+}
+
+impl Path {
+    /// Pose `T_world_sensor` at `s`.
+    fn pose(&self, s: f64, sensor: &Sensor, scene: &Bvh) -> Rigid {
+        match self {
+            Self::Ring(ring) => ring.pose(s, sensor, scene),
+            Self::Walk(walk) => walk.pose(s, sensor),
+        }
+    }
 
     /// Poses `T_world_sensor` of `count` scans, neighbours overlapping by `wanted` as nearly as the path allows.
     pub(super) fn poses(&self, count: usize, wanted: f64, sensor: &Sensor, scene: &Bvh) -> Vec<Rigid> {
@@ -77,14 +128,18 @@ impl Path {
         poses
     }
 
-    /// The first step from `s`, at most half the way round, at which the overlap falls to `wanted`; where it
+    /// The first step from `s`, at most half the way round a ring, at which the overlap falls to `wanted`; where it
     /// never does, the one at which it is least.
     fn step(&self, s: f64, from: &Rigid, wanted: f64, sensor: &Sensor, scene: &Bvh) -> f64 {
         let shared = |step: f64| mutual_overlap(scene, sensor, from, &self.pose(s + step, sensor, scene));
-        let mut least = (1.0, TAU / STRIDES as f64);
+        let longest = match self {
+            Self::Ring(_) => PI,
+            Self::Walk(_) => STRIDE_M,
+        };
+        let at = |stride: usize| longest * stride as f64 / STRIDES as f64;
+        let mut least = (1.0, at(2));
         for stride in 1..=STRIDES {
-            let (mut low, mut high) =
-                (PI * (stride - 1) as f64 / STRIDES as f64, PI * stride as f64 / STRIDES as f64);
+            let (mut low, mut high) = (at(stride - 1), at(stride));
             let share = shared(high);
             if share < wanted {
                 for _ in 0..BISECTIONS {

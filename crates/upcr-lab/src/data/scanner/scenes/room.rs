@@ -115,7 +115,7 @@ fn walls(rng: &mut impl Rng) -> Assembly {
     walls
 }
 
-fn shelf(rng: &mut impl Rng) -> Assembly {
+pub(super) fn shelf(rng: &mut impl Rng) -> Assembly {
     let (width, depth, height, boards) = (1.1, 0.32, 1.9, 5);
     let mut shelf = Assembly::default();
     for side in [-0.5, 0.5] {
@@ -145,7 +145,7 @@ fn shelf(rng: &mut impl Rng) -> Assembly {
     shelf
 }
 
-fn sofa(rng: &mut impl Rng) -> Assembly {
+pub(super) fn sofa(rng: &mut impl Rng) -> Assembly {
     // Its back stands at -y, so that it faces +y before it is turned.
     let mut sofa = Assembly::default();
     sofa.cuboid(V::new(0.0, 0.0, 0.08), V::new(1.9, 0.85, 0.34), 0.0);
@@ -161,7 +161,7 @@ fn sofa(rng: &mut impl Rng) -> Assembly {
     sofa
 }
 
-fn dining_table(rng: &mut impl Rng) -> Assembly {
+pub(super) fn dining_table(rng: &mut impl Rng) -> Assembly {
     let mut table = Assembly::default();
     table.cuboid(V::new(0.0, 0.0, 0.71), V::new(1.4, 0.85, 0.04), 0.0);
     for (x, y) in [(-0.62, -0.35), (0.62, -0.35), (-0.62, 0.35), (0.62, 0.35)] {
@@ -173,7 +173,7 @@ fn dining_table(rng: &mut impl Rng) -> Assembly {
     table
 }
 
-fn chair() -> Assembly {
+pub(super) fn chair() -> Assembly {
     // Its backrest stands at +y.
     let mut chair = Assembly::default();
     chair.cuboid(V::new(0.0, 0.0, 0.43), V::new(0.42, 0.42, 0.04), 0.0);
@@ -185,7 +185,7 @@ fn chair() -> Assembly {
 }
 
 /// A vase, a box or a stone.
-fn knick_knack(scene: &mut Assembly, base: V, rng: &mut impl Rng) {
+pub(super) fn knick_knack(scene: &mut Assembly, base: V, rng: &mut impl Rng) {
     let size = rng.random_range(0.07..0.13);
     match rng.random_range(0..3) {
         0 => {
@@ -210,7 +210,7 @@ fn lamp(scene: &mut Assembly, base: V) {
     scene.blob(base + V::z() * 1.62, V::repeat(0.18), None, 32);
 }
 
-fn plant(scene: &mut Assembly, base: V, rng: &mut impl Rng) {
+pub(super) fn plant(scene: &mut Assembly, base: V, rng: &mut impl Rng) {
     scene.revolve(base, &[(0.0, 0.0), (0.14, 0.0), (0.2, 0.35), (0.0, 0.33)], 24);
     for _ in 0..7 {
         let tilt = standing(base + V::z() * 0.33, rng.random_range(-PI..PI));
