@@ -46,6 +46,45 @@ fn a_folder_becomes_a_model_with_poses() {
     assert!(text.lines().skip(1).all(|line| line.split(' ').count() == 8), "{text}");
 }
 
+/// A 4×4 matrix that `upcr synth` wrote.
+fn matrix(path: &str) -> [[f64; 4]; 4] {
+    let text = fs::read_to_string(path).unwrap();
+    let values: Vec<f64> = text.split_whitespace().map(|word| word.parse().unwrap()).collect();
+    std::array::from_fn(|r| std::array::from_fn(|c| values[4 * r + c]))
+}
+
+fn product(a: &[[f64; 4]; 4], b: &[[f64; 4]; 4]) -> [[f64; 4]; 4] {
+    std::array::from_fn(|r| std::array::from_fn(|c| (0..4).map(|k| a[r][k] * b[k][c]).sum()))
+}
+
+/// Where scans are known from where they were seen, rooms that look alike are told apart.
+#[test]
+fn rooms_that_look_alike_are_not_taken_for_each_other() {
+    let scratch = Scratch::new();
+    let folder = scratch.path("building");
+    let run =
+        upcr(["synth", "--scene", "building", "--scans", "16", "--turned", "--seed", "2", "--out", &folder]);
+    assert_eq!(run.status, 0, "{}", run.stderr);
+    let model = scratch.path("model.ply");
+    let told = upcr(["merge", &folder, "-o", &model, "--viewpoint", "0,0,0", "--json"]).json();
+    let world = |name: &serde_json::Value| {
+        let number = name.as_str().unwrap().trim_matches(|c: char| !c.is_ascii_digit());
+        matrix(&format!("{folder}/T_world_{number}.txt"))
+    };
+    let mut kept = 0;
+    for pair in told["pairs"].as_array().unwrap().iter().filter(|pair| pair["kept"] == true) {
+        kept += 1;
+        let found: [[f64; 4]; 4] = serde_json::from_value(pair["T_target_source"].clone()).unwrap();
+        // Where the pair lays the source in the world.
+        let laid = product(&world(&pair["target_name"]), &found);
+        let truth = world(&pair["source_name"]);
+        let off: f64 = (0..3).map(|k| (laid[k][3] - truth[k][3]).powi(2)).sum::<f64>().sqrt();
+        let cosine: f64 = (0..3).map(|r| (0..3).map(|c| laid[r][c] * truth[r][c]).sum::<f64>()).sum::<f64>();
+        assert!(off < 0.3 && (cosine - 1.0) / 2.0 > 0.996, "{} {}", pair["source_name"], pair["target_name"]);
+    }
+    assert!(kept >= 10, "{kept}");
+}
+
 #[test]
 fn what_was_stopped_goes_on() {
     let scratch = Scratch::new();

@@ -32,7 +32,7 @@ pub struct Evidence {
     /// Of the points within a voxel of the other cloud, the share whose normal agrees with that of the nearest point
     /// there, and the share with that of the nearest of its own cloud.
     pub facing: [f64; 2],
-    /// Of the points within four voxels of the other cloud or where its sensor saw through to something behind, the share
+    /// Of the points within two voxels of the other cloud or where its sensor saw through to something behind, the share
     /// of the latter; `None` where it is known of neither cloud from where it was seen.
     pub in_free_space: Option<f64>,
     /// Score of the best clearly different pose over that of this one; 0 where there is none.

@@ -15,7 +15,7 @@ const NO_OVERLAP: f64 = 0.1;
 const LOW_OVERLAP: f64 = 0.3;
 /// Of training pairs' right poses, told the viewpoints to within a twentieth of the clouds' diameter, hardly one in a hundred
 /// sets a larger share of the points in free space; of the wrong ones, which were chosen to set few, four in ten do.
-const SEEN_THROUGH: f64 = 0.05;
+const SEEN_THROUGH: f64 = 0.1;
 /// A caveat that speaks against the pose itself leaves at most this.
 const DOUBTFUL: f64 = 0.45;
 
@@ -113,7 +113,7 @@ mod tests {
             (Evidence { overlap: [0.02, 0.03], ..GOOD }, Reason::NoOverlap),
             (Evidence { inliers: 5, ..GOOD }, Reason::TooFewPoints),
             (Evidence { rivals: 1, ..GOOD }, Reason::Ambiguous),
-            (Evidence { in_free_space: Some(0.1), ..GOOD }, Reason::SeenThrough),
+            (Evidence { in_free_space: Some(0.2), ..GOOD }, Reason::SeenThrough),
             (Evidence { free_directions: 1, ..GOOD }, Reason::DegenerateAxis),
             (Evidence { points: 20, ..GOOD }, Reason::TooFewPoints),
             (
