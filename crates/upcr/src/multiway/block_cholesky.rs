@@ -2,7 +2,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix6, Vector6};
+
+/// Columns of a full matrix that are eliminated together.
+const PANEL: usize = 48;
 
 /// Which blocks the factor L of P H Pᵀ = L Lᵀ has, for every H with the same blocks.
 #[derive(Debug)]
@@ -13,6 +16,8 @@ pub(super) struct Pattern {
     step: Vec<usize>,
     /// Later steps, ascending, whose block row meets the step's column.
     below: Vec<Vec<usize>>,
+    /// From this step on every block row meets all later ones.
+    full: usize,
 }
 
 impl Pattern {
@@ -26,10 +31,14 @@ impl Pattern {
             }
         }
         let mut queue: BTreeSet<(usize, usize)> = (0..rows).map(|i| (neighbors[i].len(), i)).collect();
-        let (mut order, mut step) = (Vec::with_capacity(rows), vec![0; rows]);
+        let mut order = Vec::with_capacity(rows);
         let mut left = Vec::with_capacity(rows);
-        while let Some((_, row)) = queue.pop_first() {
-            step[row] = order.len();
+        while let Some(&(count, row)) = queue.first() {
+            // Who has the fewest neighbours has all: so have the others.
+            if count + 1 == queue.len() {
+                break;
+            }
+            queue.pop_first();
             order.push(row);
             let met = std::mem::take(&mut neighbors[row]);
             for &a in &met {
@@ -40,7 +49,13 @@ impl Pattern {
             }
             left.push(met);
         }
-        let below = left
+        let full = order.len();
+        order.extend(queue.into_iter().map(|(_, row)| row));
+        let mut step = vec![0; rows];
+        for (k, &row) in order.iter().enumerate() {
+            step[row] = k;
+        }
+        let mut below: Vec<Vec<usize>> = left
             .into_iter()
             .map(|met| {
                 let mut steps: Vec<usize> = met.into_iter().map(|row| step[row]).collect();
@@ -48,7 +63,8 @@ impl Pattern {
                 steps
             })
             .collect();
-        Self { order, step, below }
+        below.extend((full..rows).map(|k| (k + 1..rows).collect()));
+        Self { order, step, below, full }
     }
 
     /// The x of H x = b, H given by its diagonal and by the blocks (row, column) above it, each once; `None` where H is not
@@ -59,19 +75,17 @@ impl Pattern {
         above: &BTreeMap<(usize, usize), Matrix6<f64>>,
         b: &[Vector6<f64>],
     ) -> Option<Vec<Vector6<f64>>> {
-        let steps = self.order.len();
         let mut pivots: Vec<Matrix6<f64>> = self.order.iter().map(|&row| diagonal[row]).collect();
         let mut columns: Vec<Vec<Matrix6<f64>>> =
             self.below.iter().map(|below| vec![Matrix6::zeros(); below.len()]).collect();
-        let at = |column: usize, row: usize| self.below[column].binary_search(&row).ok();
         for (&(row, column), block) in above {
             let (i, j) = (self.step[row], self.step[column]);
             // Below the diagonal of the permuted matrix.
             let (column, row, block) = if i < j { (i, j, block.transpose()) } else { (j, i, *block) };
-            columns[column][at(column, row)?] += block;
+            columns[column][self.below[column].binary_search(&row).ok()?] += block;
         }
         let mut x: Vec<Vector6<f64>> = self.order.iter().map(|&row| b[row]).collect();
-        for k in 0..steps {
+        for k in 0..self.full {
             let pivot = pivots[k].cholesky()?.unpack();
             pivots[k] = pivot;
             let mut column = std::mem::take(&mut columns[k]);
@@ -80,18 +94,23 @@ impl Pattern {
                 *block = pivot.solve_lower_triangular(&block.transpose())?.transpose();
             }
             x[k] = pivot.solve_lower_triangular(&x[k])?;
-            for (a, &i) in self.below[k].iter().enumerate() {
-                pivots[i] -= column[a] * column[a].transpose();
+            let below = &self.below[k];
+            for (a, &i) in below.iter().enumerate() {
+                let transposed = column[a].transpose();
+                pivots[i] -= column[a] * transposed;
                 let update = column[a] * x[k];
                 x[i] -= update;
-                for (b, &j) in self.below[k].iter().enumerate().skip(a + 1) {
-                    let place = at(i, j)?;
-                    columns[i][place] -= column[b] * column[a].transpose();
+                // What the step's column has, that of a later step has too: elimination has filled it in.
+                let mut into = columns[i].iter_mut().zip(&self.below[i]);
+                for (block, row) in column.iter().zip(below).skip(a + 1) {
+                    let (into, _) = into.find(|(_, all)| *all == row)?;
+                    *into -= block * transposed;
                 }
             }
             columns[k] = column;
         }
-        for k in (0..steps).rev() {
+        self.solve_full(&pivots, &columns, &mut x)?;
+        for k in (0..self.full).rev() {
             let mut rest = x[k];
             for (block, &i) in columns[k].iter().zip(&self.below[k]) {
                 rest -= block.transpose() * x[i];
@@ -100,6 +119,60 @@ impl Pattern {
         }
         Some(self.step.iter().map(|&step| x[step]).collect())
     }
+
+    /// The part of x from where on the matrix is full.
+    fn solve_full(
+        &self,
+        pivots: &[Matrix6<f64>],
+        columns: &[Vec<Matrix6<f64>>],
+        x: &mut [Vector6<f64>],
+    ) -> Option<()> {
+        let steps = self.order.len() - self.full;
+        let mut matrix = DMatrix::zeros(6 * steps, 6 * steps);
+        for (j, (pivot, column)) in pivots.iter().zip(columns).skip(self.full).enumerate() {
+            for (i, block) in std::iter::once(pivot).chain(column).enumerate() {
+                matrix.fixed_view_mut::<6, 6>(6 * (i + j), 6 * j).copy_from(block);
+            }
+        }
+        factorize(&mut matrix)?;
+        let mut rest = DVector::from_iterator(6 * steps, x[self.full..].iter().flatten().copied());
+        if !(matrix.solve_lower_triangular_mut(&mut rest) && matrix.tr_solve_lower_triangular_mut(&mut rest))
+        {
+            return None;
+        }
+        for (x, rest) in x[self.full..].iter_mut().zip(rest.as_slice().chunks_exact(6)) {
+            x.copy_from_slice(rest);
+        }
+        Some(())
+    }
+}
+
+/// The factor L of a full matrix A = L Lᵀ in place of its lower half; `None` where A is not positive definite.
+fn factorize(matrix: &mut DMatrix<f64>) -> Option<()> {
+    let rows = matrix.nrows();
+    for start in (0..rows).step_by(PANEL) {
+        let width = PANEL.min(rows - start);
+        let next = start + width;
+        let corner = matrix.view((start, start), (width, width)).clone_owned().cholesky()?.unpack();
+        let mut across = matrix.view((next, start), (rows - next, width)).transpose();
+        if !corner.solve_lower_triangular_mut(&mut across) {
+            return None;
+        }
+        let down = across.transpose();
+        matrix.view_mut((start, start), (width, width)).copy_from(&corner);
+        matrix.view_mut((next, start), (rows - next, width)).copy_from(&down);
+        // The lower half of what is left, by panels: products of large matrices are where the time goes, and fast.
+        for at in (next..rows).step_by(PANEL) {
+            let width = PANEL.min(rows - at);
+            matrix.view_mut((at, at), (rows - at, width)).gemm(
+                -1.0,
+                &down.rows(at - next, rows - at),
+                &across.columns(at - next, width),
+                1.0,
+            );
+        }
+    }
+    Some(())
 }
 
 #[cfg(test)]

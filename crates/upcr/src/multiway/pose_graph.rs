@@ -228,12 +228,13 @@ impl PoseGraph {
                 f64::from(u8::from(*within)) * (yes + 1) as f64 / (yes + no + 1) as f64
             })
             .collect();
+        let pattern = problem.pattern(|e| within[e]);
         while scale > 1.0 {
             for _ in 0..STEPS {
                 let weights: Vec<f64> = (error(&poses).iter().zip(&most).zip(&agreement))
                     .map(|((x, m), agreement)| agreement * (scale * m / (scale * m + x)).powi(2))
                     .collect();
-                problem.step(&mut poses, &weights);
+                problem.step(&pattern, &mut poses, &weights);
                 hear(&poses);
             }
             scale /= ANNEALING;
@@ -248,8 +249,10 @@ impl PoseGraph {
             }
             kept = now;
             let weights: Vec<f64> = kept.iter().map(|&k| f64::from(u8::from(k))).collect();
+            // Wrong edges join what lies apart: without them the factor has far fewer blocks.
+            let pattern = problem.pattern(|e| kept[e]);
             for _ in 0..MOST_STEPS {
-                let saved = problem.step(&mut poses, &weights);
+                let saved = problem.step(&pattern, &mut poses, &weights);
                 hear(&poses);
                 if saved < SETTLED {
                     break;
@@ -473,13 +476,23 @@ impl Problem<'_> {
         [by_source, by_target]
     }
 
-    /// One step of Levenberg and Marquardt; the share of the cost that it saved.
-    fn step(&self, poses: &mut Vec<Rigid>, weights: &[f64]) -> f64 {
+    /// What the factor is made of when these edges have weight.
+    fn pattern(&self, weighty: impl Fn(usize) -> bool) -> Pattern {
+        let count = self.free.iter().flatten().count();
+        let edges = self.graph.edges.iter().enumerate().filter(|(e, _)| weighty(*e));
+        Pattern::new(count, edges.filter_map(|(_, edge)| self.free[edge.source].zip(self.free[edge.target])))
+    }
+
+    /// One step of Levenberg and Marquardt; the share of the cost that it saved. Edges with weight are in the pattern.
+    fn step(&self, pattern: &Pattern, poses: &mut Vec<Rigid>, weights: &[f64]) -> f64 {
         let count = self.free.iter().flatten().count();
         let mut diagonal = vec![Matrix6::zeros(); count];
         let mut above: BTreeMap<(usize, usize), Matrix6<f64>> = BTreeMap::new();
         let mut right = vec![Vector6::zeros(); count];
         for (e, (edge, &weight)) in self.graph.edges.iter().zip(weights).enumerate() {
+            if weight == 0.0 {
+                continue;
+            }
             let ends = [edge.source, edge.target].map(|scan| self.free[scan]);
             let (predicted, error) = self.error(poses, e);
             let by = self.derivatives(&predicted, &error, e);
@@ -496,7 +509,6 @@ impl Problem<'_> {
                 *above.entry(place).or_insert_with(Matrix6::zeros) += block;
             }
         }
-        let pattern = Pattern::new(count, above.keys().copied());
         let before = self.cost(poses, weights);
         let mut damping = 1e-9;
         while damping < 1e6 {
