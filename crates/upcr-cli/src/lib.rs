@@ -27,6 +27,8 @@ use std::ffi::OsString;
 
 use clap::{Parser, Subcommand};
 
+pub use input::short_names;
+pub use merge::scans_in;
 pub use pairs::Pairs;
 
 /// How a command ended, as the exit status tells it.

@@ -175,13 +175,8 @@ fn found(given: &[PathBuf], output: &Path) -> Result<Vec<PathBuf>> {
     let mut paths = Vec::new();
     for path in given {
         if path.is_dir() {
-            let mut inside: Vec<PathBuf> = fs::read_dir(path)
-                .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
-                .with_context(|| path.display().to_string())?;
-            inside.retain(|p| p.is_file() && io::format_name(p).is_some() && !is_model(p, output));
-            // Poses lie beside scans, and their four lines of numbers read as points too.
-            inside.retain(|p| io::read_transform(p).is_err());
-            inside.sort();
+            let mut inside = scans_in(path)?;
+            inside.retain(|p| !is_model(p, output));
             if inside.is_empty() {
                 bail!("{}: there is no scan in it", path.display());
             }
@@ -196,6 +191,21 @@ fn found(given: &[PathBuf], output: &Path) -> Result<Vec<PathBuf>> {
         bail!("two scans are needed at least");
     }
     Ok(paths)
+}
+
+/// The scans of a folder, in the order of their names: every file of a known format that holds no pose.
+///
+/// # Errors
+/// Where the folder cannot be read.
+pub fn scans_in(folder: &Path) -> upcr::Result<Vec<PathBuf>> {
+    let mut inside: Vec<PathBuf> = fs::read_dir(folder)
+        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
+        .map_err(|source| upcr::Error::Io { path: folder.to_owned(), source })?;
+    inside.retain(|p| p.is_file() && io::format_name(p).is_some());
+    // Poses lie beside scans, and their four lines of numbers read as points too.
+    inside.retain(|p| io::read_transform(p).is_err());
+    inside.sort();
+    Ok(inside)
 }
 
 /// Whether a file has the name of one of the models that `output` stands for.
@@ -293,11 +303,7 @@ fn told<'a>(merged: &'a Merged, names: &'a [String], models: &[Vec<(usize, Rigid
         covariance_inflation: merged.inflation,
         models: models.iter().map(|scans| scans.iter().map(scan).collect()).collect(),
         left_out: (merged.places.iter().zip(names))
-            .filter_map(|(place, name)| match place {
-                Place::Placed { .. } => None,
-                Place::Alone => Some(LeftOut { name, reason: "no pair with it is to be trusted" }),
-                Place::Unusable { reason } => Some(LeftOut { name, reason }),
-            })
+            .filter_map(|(place, name)| Some(LeftOut { name, reason: place.reason()? }))
             .collect(),
         pairs: (merged.pairs.iter())
             .map(|pair| ToldPair {

@@ -162,6 +162,17 @@ pub enum Place {
     },
 }
 
+impl Place {
+    /// Why the scan lies in no model, where it does not.
+    pub fn reason(&self) -> Option<&str> {
+        match self {
+            Self::Placed { .. } => None,
+            Self::Alone => Some("no pair with it is to be trusted"),
+            Self::Unusable { reason } => Some(reason),
+        }
+    }
+}
+
 /// What was made of the scans.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Merged {
