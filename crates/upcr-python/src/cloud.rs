@@ -83,7 +83,7 @@ impl Input {
     }
 
     /// The file's name.
-    fn path(&self) -> Option<&Path> {
+    pub fn path(&self) -> Option<&Path> {
         match self {
             Self::File(path) => Some(path),
             Self::Points(_) => None,

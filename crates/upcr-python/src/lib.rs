@@ -10,6 +10,7 @@ mod cloud;
 mod errors;
 mod features;
 mod files;
+mod merge;
 mod model;
 mod objects;
 mod register;
@@ -27,6 +28,8 @@ mod _upcr {
     use super::features::describe;
     #[pymodule_export]
     use super::files::{read, write};
+    #[pymodule_export]
+    use super::merge::{Scans, merge, scans_in};
     #[pymodule_export]
     use super::model::Model;
     #[pymodule_export]

@@ -10,6 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};
 use upcr::features::MatchedFeature;
 use upcr::io::read_transform;
+use upcr::multiway::MergeSettings;
 use upcr::net::Network;
 use upcr::{Calibration, Locks, Method, Refinement, Rigid, RobustKernel, Settings};
 use upcr_cli::Pairs;
@@ -24,6 +25,22 @@ pub fn settings(given: &Bound<'_, PyDict>) -> PyResult<Settings> {
         let name: String = key.extract()?;
         if !value.is_none() {
             tell(&mut settings, &name, &value)?;
+        }
+    }
+    Ok(settings)
+}
+
+/// As [`settings`], of a merge: with those that are its own.
+pub fn merge_settings(given: &Bound<'_, PyDict>) -> PyResult<MergeSettings> {
+    let mut settings = MergeSettings::default();
+    for (key, value) in given {
+        let name: String = key.extract()?;
+        match name.as_str() {
+            _ if value.is_none() => (),
+            "neighbors" => settings.neighbors = typed(&name, &value)?,
+            "sequential" => settings.sequential = typed(&name, &value)?,
+            "max_memory_bytes" => settings.max_memory_bytes = Some(typed(&name, &value)?),
+            _ => tell(&mut settings.registration, &name, &value)?,
         }
     }
     Ok(settings)

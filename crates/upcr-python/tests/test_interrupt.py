@@ -16,6 +16,7 @@ import upcr
 LONG = {
     "register": "upcr.register(big, moved, voxel_size=0.002, threads=1, progress=begun)",
     "register_batch": "print(flush=True); upcr.register_batch([(big, moved)] * 20, voxel_size=0.002)",
+    "merge": "upcr.merge([big, moved, big[::2]], voxel_size=0.002, threads=1, progress=begun)",
     "features": "print(flush=True); upcr.features.pfh(big, k=60, threads=1)",
     "adapt": "print(flush=True); upcr.adapt([big[:5000]] * 30, epochs=500)",
 }

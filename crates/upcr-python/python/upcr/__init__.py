@@ -12,6 +12,7 @@ are in radians. Matrices are NumPy arrays, row after row.
 from . import features
 from ._adapt import Adaptation, AdaptationProgress, Errors, adapt
 from ._cloud import CloudLike, PointCloud, read, write
+from ._merge import Merged, MergedPair, MergedScan, MergeProgress, merge
 from ._model import Model
 from ._register import Progress, register, register_batch
 from ._registration import Alternative, Evidence, FreeDirection, Registration, Timings
@@ -38,6 +39,10 @@ __all__ = [
     "Evidence",
     "FormatError",
     "FreeDirection",
+    "MergeProgress",
+    "Merged",
+    "MergedPair",
+    "MergedScan",
     "Model",
     "PointCloud",
     "Progress",
@@ -49,6 +54,7 @@ __all__ = [
     "__version__",
     "adapt",
     "features",
+    "merge",
     "read",
     "register",
     "register_batch",

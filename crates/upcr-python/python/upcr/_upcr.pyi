@@ -22,6 +22,7 @@ __all__ = [
     "Error",
     "FormatError",
     "Model",
+    "Scans",
     "SettingError",
     "WeightsError",
     "__version__",
@@ -29,9 +30,11 @@ __all__ = [
     "check",
     "describe",
     "main",
+    "merge",
     "read",
     "register",
     "register_batch",
+    "scans_in",
     "write",
 ]
 
@@ -88,6 +91,23 @@ def register_batch(
     raises: bool,
     progress: Callable[[int], object] | None,
 ) -> list[_Parts | Exception]: ...
+
+@final
+class Scans:
+    def __new__(cls, scans: Sequence[_Packed], viewpoint: _Place) -> Scans: ...
+    @property
+    def names(self) -> list[str]: ...
+    def fuse(
+        self,
+        poses: Sequence[tuple[int, Sequence[Sequence[float]]]],
+        thin: float,
+        progress: Callable[[int], object] | None,
+    ) -> _Arrays: ...
+
+def merge(
+    scans: Scans, given: dict[str, Any], progress: Callable[[Any, Any, Any], object] | None
+) -> tuple[dict[str, Any], str]: ...
+def scans_in(folder: str) -> list[str]: ...
 def check(given: dict[str, Any]) -> None: ...
 def describe(
     cloud: _Packed, kind: str, k: int, radius: float | None, threads: int | None
