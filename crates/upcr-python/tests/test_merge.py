@@ -254,6 +254,16 @@ def test_fuse(scans: Scans) -> None:
             found.fuse(thin=thin)
 
 
+def test_open3d(merged: upcr.Merged, scans: Scans) -> None:
+    o3d: typing.Any = pytest.importorskip("open3d", reason="open3d cannot be imported", exc_type=ImportError)
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scan)) for scan in scans]
+    found = upcr.merge(clouds)
+    assert same(found, merged)
+    for cloud, pose in zip(clouds, poses(found), strict=True):
+        cloud.transform(pose)
+    assert np.array_equal(found.fuse().points, merged.fuse().points)
+
+
 def test_a_file_that_is_gone(scans: Scans, tmp_path: Path) -> None:
     files = write(tmp_path, scans)
     found = upcr.merge(files)
@@ -290,7 +300,9 @@ def test_progress(merged: upcr.Merged, scans: Scans) -> None:
     heard: list[upcr.MergeProgress] = []
     assert same(merged, upcr.merge(scans, progress=heard.append))
     assert heard[0] == upcr.MergeProgress("describe", 0, 5)
-    assert [one.step for one in heard] == sorted(one.step for one in heard) and heard[-1].step == "register"
+    steps = [one.step for one in heard]
+    assert steps == sorted(steps)
+    assert set(steps) == set(typing.get_args(typing.get_type_hints(upcr.MergeProgress)["step"]))
     assert all(0 <= one.done <= one.of for one in heard)
 
 
