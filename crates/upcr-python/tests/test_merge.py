@@ -101,7 +101,7 @@ def test_pairs_are_complete(merged: upcr.Merged, scans: Scans) -> None:
     for pair in merged.pairs:
         assert pair.T_target_source.shape == (4, 4) and pair.covariance.shape == (6, 6)
         assert pair.transformation is pair.T_target_source and 0 <= pair.probability <= 1 and 0 <= pair.fitness <= 1
-        assert (pair.chi_sq is None) == (pair.probability < upcr.TRUSTWORTHY)
+        assert (pair.chi_sq is None) == (pair.contradicted or pair.probability < upcr.TRUSTWORTHY)
         if pair.kept:
             together = np.linalg.inv(found[pair.target]) @ found[pair.source]
             moved = [in_frame(scans[pair.source], pose) for pose in (together, pair.T_target_source)]
@@ -294,6 +294,7 @@ def test_results_print(merged: upcr.Merged) -> None:
     odd = dataclasses.replace(pair, kept=False, reasons=["low_overlap"])
     assert "at odds with the others" in repr(odd) and repr(odd).endswith(", reasons: low_overlap>")
     assert ": not kept, " in repr(dataclasses.replace(odd, chi_sq=None))
+    assert ": contradicted, " in repr(dataclasses.replace(odd, chi_sq=None, contradicted=True))
 
 
 def test_progress(merged: upcr.Merged, scans: Scans) -> None:

@@ -65,7 +65,9 @@ class MergedPair:
     target: int
     """Number of the scan that stayed."""
     proposal: Literal["sequence", "likeness", "overlap"]
-    """Why these two: one follows the other, they look alike, or the poses found before lay one on the other."""
+    """Why these two: one follows the other, they look alike, or the poses of other pairs lay one on the other."""
+    prior: FloatArray | None
+    """Of an overlap, where the other pairs lay it, shape (4, 4)."""
     T_target_source: FloatArray
     """Takes source coordinates to target coordinates, shape (4, 4), as this pair alone has it."""
     probability: float
@@ -78,8 +80,10 @@ class MergedPair:
     """What speaks against the pose."""
     kept: bool
     """Whether the scans' poses rest on it."""
+    contradicted: bool
+    """Whether it was trusted by itself, and the pairs that would come to lie on each other by it speak against it."""
     chi_sq: float | None
-    """Squared error of the scans' poses under the covariance, where the pair was trusted by itself."""
+    """Squared error of the scans' poses under the covariance, where the pair was trusted by itself and is not contradicted."""
 
     @property
     def transformation(self) -> FloatArray:
@@ -87,7 +91,12 @@ class MergedPair:
         return self.T_target_source
 
     def __repr__(self) -> str:
-        kept = "kept" if self.kept else "not kept" if self.chi_sq is None else "at odds with the others"
+        if self.kept:
+            kept = "kept"
+        elif self.contradicted:
+            kept = "contradicted"
+        else:
+            kept = "not kept" if self.chi_sq is None else "at odds with the others"
         doubts = f", reasons: {', '.join(self.reasons)}" if self.reasons else ""
         return (
             f"<upcr.MergedPair {self.source} -> {self.target}: {kept}, probability {self.probability:.3f}, "
@@ -141,6 +150,7 @@ class Merged:
                     **pair,
                     "T_target_source": np.array(pair["T_target_source"]),
                     "covariance": np.array(pair["covariance"]),
+                    "prior": None if pair["prior"] is None else np.array(pair["prior"]),
                 }
             )
             for pair in told
@@ -188,9 +198,14 @@ class Merged:
             lines += [f"  {scan.name}  {scan.reason}" for scan in self.scans if scan.model is None]
         lines.append(f"pairs        {len(self.pairs)} registered, {sum(pair.kept for pair in self.pairs)} kept")
         dropped = [pair for pair in self.pairs if pair.chi_sq is not None and not pair.kept]
-        if dropped:
-            lines.append("trusted as pairs, and at odds with the others:")
-            for pair in dropped:
+        contradicted = [pair for pair in self.pairs if pair.contradicted]
+        for what, pairs in [
+            ("at odds with the others", dropped),
+            ("what they lay on each other speaks against them", contradicted),
+        ]:
+            if pairs:
+                lines.append(f"trusted as pairs, and {what}:")
+            for pair in pairs:
                 source, target = self.scans[pair.source].name, self.scans[pair.target].name
                 lines.append(f"  {source} -> {target}  probability {pair.probability:.3f}")
         lines.append(f"voxel size   {self.voxel_size:.6g}")
