@@ -114,7 +114,7 @@ async function run(): Promise<void> {
 function show(words: string, blobs: ReadonlyMap<string, Uint8Array<ArrayBuffer>>): void {
   const held = engine;
   if (!held) return;
-  const contents = new Contents(words, (name) => blobs.get(name) ?? new Uint8Array());
+  const contents = new Contents(JSON.parse(words), (name) => blobs.get(name) ?? new Uint8Array());
   form.hidden = true;
   report = showReport(document.body, contents, {
     toolbar: button("Files and settings", back, { title: "Back to what was registered, and how" }),

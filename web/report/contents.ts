@@ -10,8 +10,8 @@ export interface Pose {
   notations: readonly { name: string; about: string; text: string }[];
 }
 
-export interface CloudInfo {
-  name: string;
+/** How a cloud is drawn. */
+export interface Drawn {
   /** In the file, and in this page. */
   points: number;
   shown: number;
@@ -21,6 +21,10 @@ export interface CloudInfo {
   origin: Triple;
   step: number;
   colors: boolean;
+}
+
+export interface CloudInfo extends Drawn {
+  name: string;
   /** What the file says of itself. */
   comments: readonly string[];
 }
@@ -59,26 +63,31 @@ export interface Page {
 /** What the name stands for; asked for once each. */
 export type Bytes = (name: string) => Uint8Array<ArrayBuffer>;
 
+/** The points of the cloud of that number: three numbers of three bytes each, the lowest first. */
+export function readCloud(drawn: Drawn, number: number, bytes: Bytes): Cloud {
+  const packed = bytes(`points-${number}`);
+  const positions = new Float32Array(packed.length / 3);
+  for (let i = 0, at = 0; i < positions.length; i += 1, at += 3) {
+    positions[i] = ((packed[at] ?? 0) | ((packed[at + 1] ?? 0) << 8) | ((packed[at + 2] ?? 0) << 16)) * drawn.step;
+  }
+  return { positions, origin: drawn.origin, colors: drawn.colors ? bytes(`colors-${number}`) : null };
+}
+
 export class Contents {
   readonly page: Page;
   readonly #bytes: Bytes;
   readonly #distances = new Map<number, Distances>();
 
-  constructor(words: string, bytes: Bytes) {
-    this.page = JSON.parse(words) as Page;
+  constructor(page: Page, bytes: Bytes) {
+    this.page = page;
     this.#bytes = bytes;
   }
 
-  /** Points are three numbers of three bytes each, the lowest first. Asked for once each. */
+  /** Asked for once each. */
   cloud(index: number): Cloud {
     const info = this.page.clouds[index];
     if (!info) throw new RangeError(`there is no cloud ${index}`);
-    const packed = this.#bytes(`points-${index}`);
-    const positions = new Float32Array(packed.length / 3);
-    for (let i = 0, at = 0; i < positions.length; i += 1, at += 3) {
-      positions[i] = ((packed[at] ?? 0) | ((packed[at + 1] ?? 0) << 8) | ((packed[at + 2] ?? 0) << 16)) * info.step;
-    }
-    return { positions, origin: info.origin, colors: info.colors ? this.#bytes(`colors-${index}`) : null };
+    return readCloud(info, index, this.#bytes);
   }
 
   /** Distances at pose `index`, of which 0 is where the clouds lie. */

@@ -3,7 +3,8 @@
 import { turnBetween } from "@upcr/viewer";
 
 import type { Page, Pose } from "./contents.ts";
-import { button, el, legible, section } from "./dom.ts";
+import { Copying } from "./copy.ts";
+import { button, el, section } from "./dom.ts";
 
 export class Poses {
   /** The pose's numbers; none where the page has no pose. */
@@ -15,9 +16,8 @@ export class Poses {
 
   readonly #page: Page;
   readonly #title = el("p", { class: "quiet" });
-  readonly #text = el("pre", { tabindex: 0, "aria-label": "The pose" });
+  readonly #copying = new Copying("The pose");
   readonly #about = el("p", { class: "quiet" });
-  readonly #copied = el("span", { class: "quiet", role: "status" });
   readonly #notation = el("select", { id: "notation", "aria-label": "Notation" });
   readonly #buttons: HTMLButtonElement[] = [];
   #chosen = 0;
@@ -28,8 +28,8 @@ export class Poses {
     this.#notation.append(...(first?.notations ?? []).map(({ name }) => el("option", {}, name)));
     this.#notation.addEventListener("change", () => this.#show());
     this.section = first ? section("Pose", this.#title,
-      el("div", { class: "row" }, this.#notation, button("Copy", () => void this.#copy(), { id: "copy" }), this.#copied),
-      this.#text, this.#about) : null;
+      el("div", { class: "row" }, this.#notation, ...this.#copying.row),
+      this.#copying.text, this.#about) : null;
     this.alternatives = first && page.poses.length > 1 ? this.#list(first) : null;
   }
 
@@ -58,22 +58,8 @@ export class Poses {
   }
 
   #show(): void {
-    this.#text.textContent = legible(this.#told?.text ?? "");
+    this.#copying.show(this.#told?.text ?? "");
     this.#about.textContent = `${this.#told?.about ?? ""} Copy gives all digits.`;
-    this.#copied.textContent = "";
-  }
-
-  async #copy(): Promise<void> {
-    const text = this.#told?.text ?? "";
-    try {
-      await navigator.clipboard.writeText(text);
-      this.#copied.textContent = "copied";
-    } catch {
-      // Some browsers give pages from files no clipboard: the text is selected, to be copied by hand.
-      this.#text.textContent = text;
-      getSelection()?.selectAllChildren(this.#text);
-      this.#copied.textContent = "selected: copy it with Ctrl+C";
-    }
   }
 
   #list(found: Pose): HTMLElement {

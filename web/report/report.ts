@@ -1,22 +1,14 @@
 /** The report: a picture that can be turned, and all that is known about it beside. */
 
-import { type Coloring, type Palette, type Side, type Up, UPS, Viewer } from "@upcr/viewer";
+import type { Coloring, Side } from "@upcr/viewer";
 
 import { cloudSection } from "./clouds.ts";
 import type { Contents } from "./contents.ts";
-import { button, choice, el, number, section } from "./dom.ts";
+import { choice, el, number, section } from "./dom.ts";
+import { type Key, keyboard } from "./keys.ts";
 import { Poses } from "./poses.ts";
-import { isDark, onTheme, turnTheme } from "./theme.ts";
+import { Stage } from "./stage.ts";
 import { details, figures, verdict } from "./words.ts";
-
-const root = document.documentElement;
-const still = matchMedia("(prefers-reduced-motion: reduce)");
-
-const KEYS: readonly (readonly [string, string])[] = [
-  ["Space", "before, after"], ["s", "overlaid, side by side"], ["r", "distances as colours, and back"],
-  ["0", "the pose found"], ["1 … 9", "an alternative"], ["← → ↑ ↓", "turn"], ["+ −", "zoom"], ["Home", "the whole of it"],
-  ["[ ]", "smaller, larger points"], ["t", "light, dark"], ["?", "this list"],
-];
 
 /** What whoever shows a report adds to it. */
 export interface Additions {
@@ -31,48 +23,16 @@ export interface Report {
   dispose(): void;
 }
 
-function css(name: string): string {
-  return getComputedStyle(root).getPropertyValue(name).trim();
-}
-
 /** Puts the report into `host`. */
 export function showReport(host: HTMLElement, contents: Contents, additions: Additions = {}): Report {
   const { page } = contents;
   const gone = new AbortController();
 
-  function palette(): Palette {
-    return {
-      background: css("--canvas"),
-      clouds: page.clouds.map((_, i) => css(`--cloud-${i % 6}`)),
-      quiet: css("--quiet"),
-      map: isDark() ? [0.32, 1] : [0, 0.88],
-    };
-  }
-
-  // The picture.
-
-  const stage = el("div", { id: "stage" });
-  const trouble = el("p", { id: "trouble", role: "alert", hidden: true });
+  const stage = new Stage(page.clouds.map((_, i) => contents.cloud(i)), page.clouds.map((c) => c.name).join(", "), true, gone.signal);
+  const { viewer } = stage;
   const tags = el("div", { class: "tags", "aria-hidden": "true", hidden: true }, el("span", {}, "Before"), el("span", {}, "After"));
   const legend = el("figure", { id: "legend", hidden: true });
-  stage.append(trouble, tags);
-
-  const clouds = page.clouds.map((_, i) => contents.cloud(i));
-  let viewer: Viewer | null = null;
-  try {
-    viewer = new Viewer(stage, clouds, () => still.matches);
-    viewer.onTrouble = tell;
-    viewer.canvas.tabIndex = 0;
-    viewer.canvas.setAttribute("role", "img");
-    viewer.canvas.setAttribute("aria-label", `${page.clouds.map((c) => c.name).join(", ")} in 3-D. Arrow keys turn, plus and minus zoom.`);
-  } catch {
-    tell("This browser has no WebGL, or it is turned off: the clouds cannot be drawn. All else is here.");
-  }
-
-  function tell(message: string | null): void {
-    trouble.textContent = message ?? "";
-    trouble.hidden = message === null;
-  }
+  stage.element.append(tags);
 
   // What is shown.
 
@@ -124,15 +84,9 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
     );
   }
 
-  const size = el("input", { type: "range", min: 1, max: 8, step: 0.5, value: 2, id: "size" });
-  size.addEventListener("input", () => viewer?.setSize(Number(size.value)));
-  const up = choice<Up>("Up", UPS.map((axis) => [axis, axis.replace("-", "−")] as const), "z", (value) => viewer?.setUp(value));
-
-  function theme(): void {
-    const gradient = viewer?.setPalette(palette());
-    if (gradient) ramp.style.background = gradient;
-  }
-  onTheme(theme, gone.signal);
+  stage.onGradient = (gradient) => {
+    ramp.style.background = gradient;
+  };
 
   const poses = new Poses(page);
   poses.onChosen = (pose, name) => {
@@ -142,11 +96,19 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
     else showDistances();
   };
 
-  const help = el("dialog", { id: "help", "aria-label": "Keys" },
-    el("h2", {}, "Keys"),
-    el("table", {}, el("tbody", {}, ...KEYS.map(([key, what]) => el("tr", {}, el("th", { scope: "row" }, el("kbd", {}, key)), el("td", {}, what))))),
-    el("p", { class: "quiet" }, "Drag to turn, with the right button or two fingers to move; the wheel or a pinch zooms."),
-    el("form", { method: "dialog" }, el("button", {}, "Close")));
+  const digits = Array.from({ length: 9 }, (_, i) => String(i + 1));
+  const keys: readonly Key[] = [
+    { shown: "Space", about: "before, after", acts: { " ": () => registered && side.choose(side.value() === "before" ? "after" : "before") } },
+    { shown: "s", about: "overlaid, side by side", acts: { s: () => registered && layout.choose(layout.value() === "one" ? "split" : "one") } },
+    {
+      shown: "r", about: "distances as colours, and back",
+      acts: { r: () => page.distances && coloring.choose(coloring.value() === "distances" ? "clouds" : "distances") },
+    },
+    { shown: "0", about: "the pose found", acts: { 0: () => poses.choose(0) } },
+    { shown: "1 … 9", about: "an alternative", acts: Object.fromEntries(digits.map((digit) => [digit, () => poses.choose(Number(digit))])) },
+    ...stage.keys(),
+  ];
+  const help = keyboard(keys, gone.signal);
 
   const [source, target] = page.clouds;
   document.title = `UPCR: ${page.clouds.map((c) => c.name).join(registered ? " → " : ", ")}`;
@@ -157,11 +119,9 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
           registered ? side.element : null,
           registered ? layout.element : null,
           el("span", { class: "gap" }),
-          button("Reset", () => viewer?.reset(), { title: "The whole of it, from where it was seen first (Home)" }),
-          button("Theme", turnTheme, { title: "Light or dark (t)" }),
-          button("?", () => help.showModal(), { title: "Keys", "aria-label": "Keys" }),
+          ...stage.buttons(() => help.showModal()),
           additions.toolbar ?? null),
-        stage, legend),
+        stage.element, legend),
       el("aside", { "aria-label": "Report" },
         el("header", {},
           el("p", { class: "quiet" }, `UPCR ${page.version}`),
@@ -172,65 +132,16 @@ export function showReport(host: HTMLElement, contents: Contents, additions: Add
         cloudSection(page, viewer?.broughtFrom ?? null, (cloud, visible) => viewer?.setVisible(cloud, visible)),
         section("Display",
           colorings.length > 1 ? el("div", { class: "field" }, el("span", {}, "Colours"), coloring.element) : null,
-          el("div", { class: "field" }, el("label", { for: "size" }, "Point size"), size),
-          el("div", { class: "field" }, el("span", {}, "Up"), up.element)),
+          ...stage.fields()),
         figures(page), details(page))),
     announced, help,
   ];
   host.prepend(...shown);
 
-  theme();
+  stage.paint();
   if (registered) poses.choose(0);
   viewer?.setSide(side.value());
   showDistances();
-
-  const step = (by: number) => {
-    size.valueAsNumber += by;
-    size.dispatchEvent(new Event("input"));
-  };
-  const TURN = Math.PI / 24;
-  const keys: Record<string, () => void> = {
-    " ": () => registered && side.choose(side.value() === "before" ? "after" : "before"),
-    s: () => registered && layout.choose(layout.value() === "one" ? "split" : "one"),
-    r: () => page.distances && coloring.choose(coloring.value() === "distances" ? "clouds" : "distances"),
-    ArrowLeft: () => viewer?.orbit(-TURN, 0),
-    ArrowRight: () => viewer?.orbit(TURN, 0),
-    ArrowUp: () => viewer?.orbit(0, -TURN),
-    ArrowDown: () => viewer?.orbit(0, TURN),
-    "+": () => viewer?.zoom(1.2),
-    "=": () => viewer?.zoom(1.2),
-    "-": () => viewer?.zoom(1 / 1.2),
-    Home: () => viewer?.reset(),
-    "[": () => step(-0.5),
-    "]": () => step(0.5),
-    t: turnTheme,
-    "?": () => help.showModal(),
-  };
-
-  let pointedAt: HTMLElement | null = null;
-  document.addEventListener("click", ({ detail, target: at }) => {
-    // Keys click too, without a count.
-    pointedAt = detail > 0 && at instanceof Element ? at.closest<HTMLElement>("button, summary") : null;
-  }, { signal: gone.signal });
-  document.addEventListener("keydown", (event) => {
-    if (event.key === "Tab") pointedAt = null;
-    if (event.ctrlKey || event.metaKey || event.altKey || help.open) return;
-    const { target: at } = event;
-    const element = at instanceof Element ? at : null;
-    // What a focused control does with a key comes first.
-    if (element?.matches("input, select, textarea")) return;
-    if (event.key === " " && element?.matches("button, summary")) {
-      if (element !== pointedAt) return;
-      // A button that was clicked has the focus too, and whoever clicked it does not mean it any more.
-      pointedAt.blur();
-    }
-    if (/^Arrow|^Home$/.test(event.key) && element?.closest("aside, pre")) return;
-    const digit = /^[0-9]$/.test(event.key) ? Number(event.key) : null;
-    const act = digit === null ? keys[event.key] : () => poses.choose(digit);
-    if (!act) return;
-    event.preventDefault();
-    act();
-  }, { signal: gone.signal });
 
   return {
     dispose() {

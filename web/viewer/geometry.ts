@@ -8,13 +8,31 @@ export type Rows = readonly (readonly number[])[];
 
 export const IDENTITY: Rows = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
 
+/** One motion after the other, the right one first. */
+export function product(a: Rows, b: Rows): Rows {
+  const at = (m: Rows, r: number, c: number) => m[r]?.[c] ?? 0;
+  return [0, 1, 2, 3].map((r) => [0, 1, 2, 3].map((c) =>
+    at(a, r, 0) * at(b, 0, c) + at(a, r, 1) * at(b, 1, c) + at(a, r, 2) * at(b, 2, c) + at(a, r, 3) * at(b, 3, c)));
+}
+
+/** The motion back. */
+export function inverse(m: Rows): Rows {
+  const at = (r: number, c: number) => m[r]?.[c] ?? 0;
+  const rows = [0, 1, 2].map((r) => {
+    const turned = [at(0, r), at(1, r), at(2, r)] as const;
+    return [...turned, -(turned[0] * at(0, 3) + turned[1] * at(1, 3) + turned[2] * at(2, 3))];
+  });
+  return [...rows, [0, 0, 0, 1]];
+}
+
 /** Of a cloud, as the sphere that holds nearly all of it: a few stray points do not push the rest into the distance. */
 export interface Ball {
   center: Vector3;
   radius: number;
 }
 
-const SAMPLE = 20_000;
+/** Points that stand for all. */
+export const SAMPLE = 20_000;
 const HELD = 0.99;
 
 /** The ball of points in random order, of which the first are a sample of all. */

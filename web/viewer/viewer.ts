@@ -7,7 +7,7 @@ import {
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 import { colormap, gradient } from "./colormap.ts";
-import { type Ball, ball, between, IDENTITY, moved, place, type Placement, type Rows, type Triple, union } from "./geometry.ts";
+import { type Ball, ball, between, IDENTITY, moved, place, type Placement, type Rows, SAMPLE, type Triple, union } from "./geometry.ts";
 
 /** A cloud to be shown. The first one is moved by poses; the second is what it is moved onto. */
 export interface Cloud {
@@ -71,7 +71,10 @@ void main() {
 /** Milliseconds of a frame above which fewer points are drawn while the view moves, and below which more are. */
 const SLOW = 50;
 const FAST = 25;
-const FEWEST = 20_000;
+/** Points that are always drawn, of all clouds together. */
+const FEWEST = 40_000;
+/** So many points fill the picture. */
+const MANY = 60_000;
 /** Without a move for so many milliseconds, all points are drawn. */
 const STILL = 160;
 const FLIGHT = 700;
@@ -105,14 +108,20 @@ export class Viewer {
   readonly #drawn: Points<BufferGeometry, ShaderMaterial>[] = [];
   readonly #balls: Ball[];
   readonly #from: Triple;
-  readonly #before: Placement;
+  #before: Placement;
   #after: Placement;
   #flight: { from: Placement; fromHome: Ball; start: number } | null = null;
   #shown: { placement: Placement; home: Ball };
+  /** Where the others lie; of the first it is of no use. */
+  readonly #lying: Placement[];
+  /** What the camera has to see where only some clouds are shown. */
+  #framed: Ball | null = null;
   #side: Side = "before";
   #split = false;
   #up: Up = "z";
   #size = 2;
+  /** Points are larger where few are shown. */
+  #grown = 1;
   #share = 1;
   #moving = false;
   #stillAt = 0;
@@ -128,8 +137,9 @@ export class Viewer {
   #coloring: Coloring = "clouds";
   #range = 1;
 
-  /** @throws where the browser has no WebGL. */
-  constructor(host: HTMLElement, clouds: readonly Cloud[], private readonly still: () => boolean) {
+  /** @param near whether a first cloud that lies far from the second is brought to it.
+   *  @throws where the browser has no WebGL. */
+  constructor(host: HTMLElement, clouds: readonly Cloud[], private readonly still: () => boolean, near: boolean) {
     this.#renderer = new WebGLRenderer({ antialias: true, powerPreference: "high-performance" });
     this.canvas = this.#renderer.domElement;
     this.#clouds = clouds;
@@ -139,7 +149,8 @@ export class Viewer {
     this.#balls = clouds.map((c) => ball(c.positions));
     const [source] = clouds;
     const lies = place(IDENTITY, source?.origin ?? this.#from, this.#from);
-    this.broughtFrom = this.#bring(lies);
+    this.#lying = clouds.map((cloud) => place(IDENTITY, cloud.origin, this.#from));
+    this.broughtFrom = near ? this.#bring(lies) : null;
     this.#before = lies;
     this.#after = lies;
     this.#shown = { placement: lies, home: this.#home(lies) };
@@ -159,10 +170,7 @@ export class Viewer {
       });
       const points = new Points(geometry, material);
       points.frustumCulled = false;
-      if (i > 0) {
-        const at = place(IDENTITY, cloud.origin, this.#from);
-        points.position.copy(at.translation);
-      }
+      if (i > 0) points.position.copy(this.#lying[i]?.translation ?? points.position);
       this.#drawn.push(points);
       this.#world.add(points);
     });
@@ -227,6 +235,30 @@ export class Viewer {
   setVisible(cloud: number, visible: boolean): void {
     const points = this.#drawn[cloud];
     if (points) points.visible = visible;
+    this.draw();
+  }
+
+  /** Only these clouds, each moved by its pose; the camera turns to them. */
+  showOnly(poses: ReadonlyMap<number, Rows>): void {
+    const [first] = this.#clouds;
+    const pose = poses.get(0);
+    if (first && pose) {
+      // It is there at once, and only the camera flies.
+      this.#before = this.#after = this.#shown.placement = place(pose, first.origin, this.#from);
+    }
+    this.#depart();
+    this.#drawn.forEach((points, i) => {
+      const [cloud, to] = [this.#clouds[i], poses.get(i)];
+      points.visible = to !== undefined;
+      if (i === 0 || !cloud || !to) return;
+      const at = place(to, cloud.origin, this.#from);
+      this.#lying[i] = at;
+      points.quaternion.copy(at.rotation);
+      points.position.copy(at.translation);
+    });
+    this.#framed = this.#ballOf([...poses.keys()]);
+    const shown = this.#drawn.reduce((sum, points) => sum + (points.visible ? points.geometry.getAttribute("position").count : 0), 0);
+    this.#grown = Math.min(Math.max(Math.sqrt(MANY / Math.max(shown, 1)), 1), 3);
     this.draw();
   }
 
@@ -369,8 +401,25 @@ export class Viewer {
 
   /** What the camera has to see where the first cloud is at `placement`. */
   #home(placement: Placement): Ball {
-    return union(this.#balls.map((b, i) =>
-      moved(b, i === 0 ? placement : place(IDENTITY, this.#clouds[i]?.origin ?? this.#from, this.#from))));
+    if (this.#framed) return this.#framed;
+    const balls = this.#balls.map((b, i) => moved(b, i === 0 ? placement : this.#lying[i] ?? placement));
+    return union(balls);
+  }
+
+  /** The ball of the points of some clouds, as they lie: many clouds have more stray points than one. */
+  #ballOf(clouds: readonly number[]): Ball {
+    const most = Math.ceil(SAMPLE / Math.max(clouds.length, 1));
+    const sample: number[] = [];
+    const point = new Vector3();
+    for (const i of clouds) {
+      const [positions, at] = [this.#clouds[i]?.positions, i === 0 ? this.#before : this.#lying[i]];
+      if (!positions || !at) continue;
+      for (let k = 0; k < Math.min(positions.length, 3 * most); k += 3) {
+        sample.push(...point.fromArray(positions, k).applyQuaternion(at.rotation).add(at.translation));
+      }
+    }
+    const { center, radius } = ball(new Float32Array(sample));
+    return { center, radius: radius > 0 ? radius : 1 };
   }
 
   /** Brings a cloud that lies far from the second beside it; tells from how far. */
@@ -432,7 +481,7 @@ export class Viewer {
     const share = busy ? this.#share : 1;
     for (const { geometry } of this.#drawn) {
       const count = geometry.getAttribute("position").count;
-      geometry.setDrawRange(0, Math.min(count, Math.max(FEWEST, Math.ceil(share * count))));
+      geometry.setDrawRange(0, Math.min(count, Math.ceil(Math.max(FEWEST / Math.max(this.#drawn.length, 2), share * count))));
     }
 
     const goal = this.#placement(this.#side);
@@ -486,7 +535,7 @@ export class Viewer {
     this.#camera.near = distance / 200;
     this.#camera.far = distance + 60;
     this.#camera.updateProjectionMatrix();
-    for (const points of this.#drawn) set(points, { size: this.#size * ratio, depth: distance });
+    for (const points of this.#drawn) set(points, { size: this.#size * this.#grown * ratio, depth: distance });
     this.#renderer.setViewport(x, y, width, height);
     this.#renderer.setScissor(x, y, width, height);
     this.#renderer.render(this.#scene, this.#camera);

@@ -3,6 +3,7 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
+use serde::Serialize;
 use upcr::neighbors::KdTree;
 use upcr::{CloudRole, Error, PointCloud, Result, Rigid};
 
@@ -25,6 +26,19 @@ const STEPS: f64 = ((1 << 24) - 1) as f64;
 const BLOCK: usize = 1 << 12;
 /// Distances are told up to this share of the target's diagonal.
 const REACH: f64 = 0.05;
+
+/// How a cloud is drawn: what its points in the page are told in.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Drawn {
+    /// In the file, and in the page.
+    pub points: usize,
+    pub shown: usize,
+    /// Without finite coordinates.
+    pub left_out: usize,
+    pub origin: [f64; 3],
+    pub step: f64,
+    pub colors: bool,
+}
 
 /// The part of a cloud that is displayed.
 pub(crate) struct Displayed<'a> {
@@ -73,6 +87,31 @@ impl<'a> Displayed<'a> {
             }
         }
         bytes
+    }
+
+    /// Puts points and colours among the blobs, under the cloud's number.
+    pub fn draw(&self, number: usize, blobs: &mut Vec<(String, Vec<u8>)>) -> Drawn {
+        blobs.push((format!("points-{number}"), self.packed()));
+        let colors = self.colors();
+        let drawn = Drawn {
+            points: self.cloud.len(),
+            shown: self.chosen.len(),
+            left_out: self.left_out,
+            origin: self.origin,
+            step: self.step,
+            colors: colors.is_some(),
+        };
+        blobs.extend(colors.map(|colors| (format!("colors-{number}"), colors)));
+        drawn
+    }
+
+    /// These points alone, moved.
+    pub fn moved(&self, pose: &Rigid) -> PointCloud {
+        let colors = self.cloud.colors.as_ref();
+        PointCloud {
+            colors: colors.map(|colors| self.chosen.iter().map(|&i| colors[i as usize]).collect()),
+            ..PointCloud::from_points(self.points().map(|p| pose.apply(p)).collect())
+        }
     }
 
     /// Red, green, blue, where the cloud has them.

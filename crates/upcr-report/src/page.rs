@@ -1,16 +1,11 @@
-//! The page: words as JSON, points as base64, and the script that draws them.
+//! The page of clouds, or of a registration of two.
 
-use std::fmt::Write;
-
-use base64::{Engine, engine::general_purpose::STANDARD};
 use serde::Serialize;
 use upcr::{PointCloud, Registration, Result, Rigid, TRUSTWORTHY};
 
-use crate::display::{Displayed, MOST_POINTS, Surface, range};
+use crate::display::{Displayed, Drawn, MOST_POINTS, Surface, range};
+use crate::html::{Contents, assemble, json};
 use crate::notation::{Notation, notations};
-
-const SCRIPT: &str = include_str!("../assets/viewer.js");
-const SCRIPT_SHA256: &str = include_str!("../assets/viewer.sha256");
 
 /// Comments of one file that a page tells, and characters of each.
 const MOST_COMMENTS: usize = 20;
@@ -26,15 +21,6 @@ pub struct Page<'a> {
     most_points: usize,
 }
 
-/// What a page is about.
-#[derive(Debug, Clone)]
-pub struct Contents {
-    /// What is to be told, as JSON in which no character means something to HTML.
-    pub words: String,
-    /// What is to be drawn: points, colours and distances, each with its name.
-    pub blobs: Vec<(String, Vec<u8>)>,
-}
-
 #[derive(Serialize)]
 struct Told<'a> {
     version: &'static str,
@@ -48,12 +34,8 @@ struct Told<'a> {
 #[derive(Serialize)]
 struct ToldCloud<'a> {
     name: &'a str,
-    points: usize,
-    shown: usize,
-    left_out: usize,
-    origin: [f64; 3],
-    step: f64,
-    colors: bool,
+    #[serde(flatten)]
+    drawn: Drawn,
     comments: &'a [String],
 }
 
@@ -154,20 +136,12 @@ impl<'a> Page<'a> {
             .collect::<Result<_>>()?;
         let mut blobs: Vec<(String, Vec<u8>)> = Vec::new();
         let mut clouds = Vec::new();
-        for (i, ((name, cloud), shown)) in self.clouds.iter().zip(&shown).enumerate() {
-            blobs.push((format!("points-{i}"), shown.packed()));
-            let colors = shown.colors();
+        for (i, ((name, _), shown)) in self.clouds.iter().zip(&shown).enumerate() {
             clouds.push(ToldCloud {
                 name,
-                points: cloud.len(),
-                shown: shown.chosen.len(),
-                left_out: shown.left_out,
-                origin: shown.origin,
-                step: shown.step,
-                colors: colors.is_some(),
+                drawn: shown.draw(i, &mut blobs),
                 comments: self.comments.get(i).map_or(&[], Vec::as_slice),
             });
-            blobs.extend(colors.map(|colors| (format!("colors-{i}"), colors)));
         }
 
         let surface = match &shown[..] {
@@ -209,45 +183,6 @@ fn told_verdict(found: &Registration) -> ToldVerdict<'_> {
         free: found.free_directions.iter().map(ToString::to_string).collect(),
         source_scale: found.source_scale,
     }
-}
-
-fn assemble(Contents { words, blobs }: &Contents) -> String {
-    let size: usize = blobs.iter().map(|(_, bytes)| 4 * bytes.len().div_ceil(3) + 64).sum();
-    let mut html = String::with_capacity(SCRIPT.len() + size + (1 << 16));
-    // No other script runs, and nothing is fetched: not from elsewhere, and not from where the page came from.
-    let _ = write!(
-        html,
-        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
-         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <meta name=\"color-scheme\" content=\"light dark\">\n\
-         <meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; script-src 'sha256-{SCRIPT_SHA256}'; \
-         base-uri 'none'; form-action 'none'\">\n<title>UPCR</title>\n</head>\n<body>\n\
-         <noscript>The clouds are drawn by the page's own script, and scripts are turned off here.</noscript>\n\
-         <script type=\"application/json\" id=\"page\">{words}</script>\n"
-    );
-    for (id, bytes) in blobs {
-        let _ = write!(html, "<script type=\"text/plain\" id=\"{id}\">");
-        STANDARD.encode_string(bytes, &mut html);
-        html.push_str("</script>\n");
-    }
-    let _ = write!(html, "<script>{SCRIPT}</script>\n</body>\n</html>\n");
-    html
-}
-
-/// JSON without a character that means something to HTML, or ends a line of a script.
-fn json(value: &impl Serialize) -> String {
-    // Numbers, text and lists always become JSON.
-    let plain = serde_json::to_string(value).unwrap_or_default();
-    let mut text = String::with_capacity(plain.len());
-    for c in plain.chars() {
-        match c {
-            '<' | '>' | '&' | '\u{2028}' | '\u{2029}' => {
-                let _ = write!(text, "\\u{:04x}", u32::from(c));
-            }
-            _ => text.push(c),
-        }
-    }
-    text
 }
 
 #[cfg(test)]
@@ -300,15 +235,6 @@ mod tests {
         assert_eq!(scripts, html.matches("</script>").count());
         // The words, two clouds, the distances as they lie, the script.
         assert_eq!(scripts, 5);
-    }
-
-    #[test]
-    fn no_script_but_the_one_inside_may_run_and_nothing_is_fetched() {
-        let cloud = cloud(0);
-        let html = Page::of_clouds(&[("a", &cloud)]).html().unwrap();
-        assert!(html.contains("default-src 'none'; script-src 'sha256-"));
-        assert!(!SCRIPT.contains("</script") && !SCRIPT.contains("<!--") && !SCRIPT.contains('\r'));
-        assert_eq!(SCRIPT_SHA256.len(), 44);
     }
 
     #[test]
