@@ -17,6 +17,7 @@ use upcr::multiway::{
 use upcr::transform::quaternion;
 use upcr::{Calibration, Method, PointCloud, Rigid, Settings, io};
 use upcr_lab::files::write_atomically;
+use upcr_report::MergePage;
 
 use crate::output::{self, Progress};
 use crate::stream::{Alignment, Layout, Streaming};
@@ -35,6 +36,10 @@ pub struct Args {
     /// scans are
     #[arg(long, value_name = "FILE")]
     poses: Option<PathBuf>,
+    /// Write a report: one HTML page, which needs no network, with the models in 3-D, the graph of the pairs, and why each was
+    /// kept or not
+    #[arg(long, value_name = "FILE")]
+    report: Option<PathBuf>,
     /// The scans are in the order in which they were taken
     #[arg(long)]
     sequential: bool,
@@ -89,7 +94,7 @@ impl Scans for Files<'_> {
 
 pub fn run(args: &Args) -> Result<Status> {
     io::check_writable(&args.output)?;
-    for path in [Some(&args.output), args.poses.as_ref()].into_iter().flatten() {
+    for path in [Some(&args.output), args.poses.as_ref(), args.report.as_ref()].into_iter().flatten() {
         output::check_folder(path)?;
     }
     let files = Files { paths: found(&args.scans, &args.output)?, reading: &args.reading };
@@ -153,6 +158,11 @@ pub fn run(args: &Args) -> Result<Status> {
         if let Some(path) = &args.poses {
             write_poses(&numbered(path, number), scans, &names)?;
         }
+    }
+    if let Some(path) = &args.report {
+        let told = |done: usize| step(&format!("writing the report: {done} of {}", names.len()));
+        let html = MergePage::new(&merged, &names).html(&files, &told)?;
+        write_atomically(path, html.as_bytes())?;
     }
     journal.done()?;
     drop(progress);

@@ -5,10 +5,12 @@
 
 mod display;
 mod html;
+mod merge_page;
 mod notation;
 mod page;
 
 pub use display::{CLOUD_COLORS, MOST_POINTS};
 pub use html::Contents;
+pub use merge_page::MergePage;
 pub use notation::{Notation, notations};
 pub use page::Page;

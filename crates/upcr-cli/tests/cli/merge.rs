@@ -86,6 +86,39 @@ fn rooms_that_look_alike_are_not_taken_for_each_other() {
 }
 
 #[test]
+fn a_report_is_written_whatever_became_of_the_scans() {
+    let scratch = Scratch::new();
+    let folder = scans(&scratch, "5");
+    let [model, report] = ["model.ply", "merge.html"].map(|name| scratch.path(name));
+    let run = upcr(["merge", &folder, "-o", &model, "--report", &report, "--json"]);
+    assert!([0, 3].contains(&run.status), "{}", run.stderr);
+    let html = fs::read_to_string(&report).unwrap();
+    let (_, words) = html.split_once("id=\"page\">").unwrap();
+    let page: serde_json::Value = serde_json::from_str(words.split_once("</script>").unwrap().0).unwrap();
+    let told = run.json();
+    assert_eq!(page["merge"]["pairs"].as_array().unwrap().len(), told["pairs"].as_array().unwrap().len());
+    for (scan, place) in
+        page["scans"].as_array().unwrap().iter().zip(page["merge"]["places"].as_array().unwrap())
+    {
+        let of = told["models"].as_array().unwrap().iter().flat_map(|m| m.as_array().unwrap());
+        let placed = of.clone().find(|other| other["name"] == scan["name"]);
+        assert_eq!(placed.map(|other| &other["T_model_scan"]), place.get("T_model_scan"));
+    }
+    assert!(html.contains("id=\"points-0\"") && html.contains("default-src 'none'"));
+
+    // Nothing has a place.
+    let [one, two] = ["one.xyz", "two.xyz"].map(|name| scratch.file(name, "1 2 3\n4 5 6\n7 8 9\n"));
+    let run = upcr(["merge", &one, &two, "-o", &scratch.path("none.ply"), "--report", &report]);
+    assert_eq!(run.status, 3);
+    let html = fs::read_to_string(&report).unwrap();
+    assert!(html.contains("one.xyz") && !html.contains("id=\"points-0\""));
+
+    // Where it cannot be written, it is said before the work.
+    let nowhere = scratch.path("nowhere/merge.html");
+    upcr(["merge", &folder, "-o", &model, "--report", &nowhere]).assert_fails(1, &["there is no folder"]);
+}
+
+#[test]
 fn what_was_stopped_goes_on() {
     let scratch = Scratch::new();
     let folder = scans(&scratch, "6");
