@@ -409,16 +409,20 @@ export class Viewer {
   /** The ball of the points of some clouds, as they lie: many clouds have more stray points than one. */
   #ballOf(clouds: readonly number[]): Ball {
     const most = Math.ceil(SAMPLE / Math.max(clouds.length, 1));
+    const at = (i: number) => (i === 0 ? this.#before : this.#lying[i]);
+    // They may be far from the origin, and single precision holds what is near.
+    const from = at(clouds[0] ?? 0)?.translation ?? new Vector3();
     const sample: number[] = [];
     const point = new Vector3();
     for (const i of clouds) {
-      const [positions, at] = [this.#clouds[i]?.positions, i === 0 ? this.#before : this.#lying[i]];
-      if (!positions || !at) continue;
+      const [positions, to] = [this.#clouds[i]?.positions, at(i)];
+      if (!positions || !to) continue;
       for (let k = 0; k < Math.min(positions.length, 3 * most); k += 3) {
-        sample.push(...point.fromArray(positions, k).applyQuaternion(at.rotation).add(at.translation));
+        sample.push(...point.fromArray(positions, k).applyQuaternion(to.rotation).add(to.translation).sub(from));
       }
     }
     const { center, radius } = ball(new Float32Array(sample));
+    center.add(from);
     return { center, radius: radius > 0 ? radius : 1 };
   }
 

@@ -34,6 +34,8 @@ export class Graph {
   #edges: number[] = [];
   #pointedAt: Selection | null = null;
   #marks: SVGGElement[] = [];
+  /** Of models, where there are several. */
+  #frames: SVGElement[] = [];
   #untrusted = false;
   #model: number | null = null;
   #selection: Selection = { kind: "all" };
@@ -150,17 +152,22 @@ export class Graph {
         node.model === null ? svg("rect", { x: -0.8 * r, y: -0.8 * r, width: 1.6 * r, height: 1.6 * r }) : svg("circle", { r }));
       return mark;
     });
-    const frames = placed.models.length > 1 ? placed.models.map((box, m) => svg("g", { class: "frame" },
-      svg("rect", { x: box.x + 3, y: box.y + 3, width: Math.max(box.width - 6, 1), height: Math.max(box.height - 6, 1), rx: 6 }),
-      ...(box.width > 60 ? [svg("text", { x: box.x + 10, y: box.y + 18 }, `model ${m + 1}`)] : []))) : [];
+    const several = placed.models.length > 1;
+    this.#frames = several ? placed.models.map((box) => svg("rect", {
+      x: box.x + 3, y: box.y + 3, width: Math.max(box.width - 6, 1), height: Math.max(box.height - 6, 1), rx: 6,
+    })) : [];
+    const frames: SVGElement[] = [...this.#frames];
+    const titles = placed.models.flatMap((box, m) => (several && box.width > 60
+      ? [svg("text", { class: "label quietly", x: box.x + 10, y: box.y + 14 }, `model ${m + 1}`)] : []));
     if (placed.leftOut) {
       const { x, y, width } = placed.leftOut;
-      frames.push(svg("g", { class: "frame" }, svg("line", { x1: x + 8, y1: y, x2: x + width - 8, y2: y })));
+      frames.push(svg("line", { x1: x + 8, y1: y, x2: x + width - 8, y2: y }));
     }
     const labels = placed.labels.flatMap((label) => (label
       ? [svg("text", { class: "label", x: label.x.toFixed(1), y: label.y.toFixed(1), "text-anchor": label.anchor }, label.text)]
       : []));
-    this.#drawing.replaceChildren(svg("g", {}, ...frames), this.#lit, svg("g", {}, ...this.#marks), svg("g", { "aria-hidden": "true" }, ...labels));
+    this.#drawing.replaceChildren(svg("g", { class: "frames" }, ...frames), this.#lit, svg("g", {}, ...this.#marks),
+      svg("g", { "aria-hidden": "true" }, ...titles, ...labels));
     this.#mark();
   }
 
@@ -181,6 +188,7 @@ export class Graph {
   }
 
   #mark(): void {
+    this.#frames.forEach((frame, m) => frame.classList.toggle("seen", m === this.#model));
     this.#marks.forEach((mark, scan) => {
       const chosen = this.#chosen(scan);
       mark.setAttribute("aria-pressed", String(chosen));
