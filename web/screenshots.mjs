@@ -40,6 +40,20 @@ upcr("register", ...scans.map((path) => path.slice(scratch.length + 1)), "--repo
 await shoot("report-alternatives.png", twofold, {}, press("1", "]"));
 await shoot("report-phone.png", sample, phone, press());
 
+// Scans of a room, of which one is of another.
+const room = join(scratch, "room");
+upcr("synth", "--scene", "room", "--scans", "14", "--size", "320x240", "--seed", "5", "--out", room);
+upcr("merge", room, join(samples, "source.ply"), "-o", join(scratch, "model.ply"), "--report", join(scratch, "merge.html"));
+const wide = { viewport: { width: 1280, height: 800 } };
+await shoot("merge.png", join(scratch, "merge.html"), wide, press("]"));
+await shoot("merge-pair.png", join(scratch, "merge.html"), { ...wide, colorScheme: "dark" }, async (page) => {
+  // What a camera sees has −y up.
+  await page.getByText("Display").click();
+  await page.getByRole("button", { name: "−y" }).click();
+  await page.keyboard.press("Escape");
+  await page.getByRole("row").filter({ hasText: "dropped" }).first().click();
+});
+
 await shoot("page.png", built, { viewport: { width: 1100, height: 560 } }, press());
 /** @param {import("playwright-core").Page} page */
 const registered = async (page) => {
