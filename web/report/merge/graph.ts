@@ -131,14 +131,15 @@ export class Graph {
     // What asks for a look lies on top.
     const order: readonly PairState[] = this.#untrusted ? ["untrusted", "kept", "dropped"] : ["kept", "dropped"];
     this.#edges = order.flatMap((state) => pairs.flatMap((_, index) => (this.#states[index] === state ? [index] : [])));
-    this.#ground.replaceChildren(...this.#edges.flatMap((index) => {
+    this.#ground.replaceChildren();
+    for (const index of this.#edges) {
       const pair = pairs[index];
       const state = this.#states[index] ?? "untrusted";
       const sure = Math.min(Math.max(((pair?.probability ?? 0) - this.#page.threshold) / (1 - this.#page.threshold), 0), 1);
-      return this.#line(index, state === "kept"
+      this.#ground.append(...this.#line(index, state === "kept"
         ? { "stroke-width": (0.8 + 1.4 * sure * Math.sqrt(strengths.kept)).toFixed(2), "stroke-opacity": (strengths.kept * (0.35 + 0.5 * sure)).toFixed(3) }
-        : { "stroke-width": 1.6, "stroke-opacity": strengths[state] });
-    }));
+        : { "stroke-width": 1.6, "stroke-opacity": strengths[state] }));
+    }
     this.#marks = this.#nodes.map((node, scan) => {
       const spot = placed.spots[scan] ?? { x: 0, y: 0 };
       const r = placed.radius;

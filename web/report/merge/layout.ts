@@ -239,11 +239,13 @@ export function layout(nodes: readonly Node[], width: number, height: number): L
   });
   const radius = Math.min(Math.max(0.3 * apart, 2.5), 7);
   const leftOut = out.length === 0 ? null : { x: 0, y: height - low, width, height: low };
-  return { spots, radius, labels: labels(nodes, spots, radius, width, height), models: boxes, leftOut };
+  return { spots, radius, labels: labels(nodes, spots, radius, width, height, lines), models: boxes, leftOut };
 }
 
 /** Names beside their nodes, where they meet neither nodes nor other names. */
-function labels(nodes: readonly Node[], spots: readonly Spot[], radius: number, width: number, height: number): (Label | null)[] {
+function labels(
+  nodes: readonly Node[], spots: readonly Spot[], radius: number, width: number, height: number, lines: boolean,
+): (Label | null)[] {
   const taken: Box[] = spots.map(({ x, y }) => ({ x: x - radius, y: y - radius, width: 2 * radius, height: 2 * radius }));
   const meets = (a: Box) => taken.some((b) =>
     a.x < b.x + b.width && b.x < a.x + a.width && a.y < b.y + b.height && b.y < a.y + a.height);
@@ -252,9 +254,12 @@ function labels(nodes: readonly Node[], spots: readonly Spot[], radius: number, 
   for (const i of order) {
     const [node, spot] = [nodes[i], spots[i]];
     if (!node || !spot) continue;
-    const wide = node.label.length * LETTER;
     const gap = radius + 3;
     const { x, y } = spot;
+    // Reasons may be long; their beginning says most.
+    const room = Math.floor((width - x - gap - 4) / LETTER);
+    const text = lines && node.model === null && node.label.length > room ? `${node.label.slice(0, Math.max(room - 1, 0))}…` : node.label;
+    const wide = text.length * LETTER;
     const choices: readonly [Label["anchor"], number, number, number][] = [
       ["start", x + gap, y, x + gap], ["end", x - gap, y, x - gap - wide],
       ["middle", x, y - gap - 0.4 * LINE, x - wide / 2], ["middle", x, y + gap + 0.4 * LINE, x - wide / 2],
@@ -263,7 +268,7 @@ function labels(nodes: readonly Node[], spots: readonly Spot[], radius: number, 
       const box = { x: left - 2, y: line - LINE / 2, width: wide + 4, height: LINE };
       if (box.x < 0 || box.y < 0 || box.x + box.width > width || box.y + box.height > height || meets(box)) continue;
       taken.push(box);
-      found[i] = { x: at, y: line, anchor, text: node.label };
+      found[i] = { x: at, y: line, anchor, text };
       break;
     }
   }
