@@ -158,6 +158,18 @@ test("a pair as it was registered is not where the model has it", async () => {
   await close();
 });
 
+test("a pair that others speak against is named so", async () => {
+  const path = altered("contradicted.html", ({ merge }) => {
+    Object.assign(merge.pairs.find((/** @type {any} */ p) => p.kept), { kept: false, contradicted: true, chi_sq: null });
+  });
+  const { page, wrong, close } = await open(path);
+  await page.getByRole("combobox", { name: "State" }).selectOption("dropped");
+  await rows(page).first().click();
+  await page.getByText("what it would lay on each other besides does not fit there").waitFor();
+  assert.deepEqual(wrong, []);
+  await close();
+});
+
 test("nodes do not meet, wherever the scans lie", async () => {
   const { outputFiles: [made] } = await build({
     entryPoints: [fileURLToPath(new URL("../report/merge/layout.ts", import.meta.url))], bundle: true, format: "esm", write: false,
@@ -276,6 +288,7 @@ test("a thousand scans and ten thousand pairs do not freeze it", async () => {
       const state = next();
       page.merge.pairs.push({
         ...pair, source, target: source - 1 - Math.floor(10 * next()), probability: next(), kept: state < 0.7, chi_sq: state < 0.75 ? 10 * next() : null,
+        contradicted: state > 0.98,
       });
     }
   });

@@ -132,13 +132,14 @@ mod tests {
             source,
             target,
             proposal: Proposal::Overlap,
+            prior: None,
             T_target_source: Rigid::identity().to_rows(),
             probability: 0.75,
             covariance: [[0.0; 6]; 6],
             fitness: 0.5,
             reasons: vec![Reason::LowOverlap],
         };
-        JudgedAttempt { attempt, kept, chi_sq }
+        JudgedAttempt { attempt, kept, contradicted: false, chi_sq }
     }
 
     fn merged() -> Merged {

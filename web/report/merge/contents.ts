@@ -20,7 +20,9 @@ export interface Pair {
   fitness: number;
   reasons: readonly string[];
   kept: boolean;
-  /** None: it was not trusted as a pair. */
+  /** It was trusted as a pair, and what it would lay on each other speaks against it. */
+  contradicted: boolean;
+  /** None: it was not trusted as a pair, or is contradicted. */
   chi_sq: number | null;
 }
 
@@ -54,7 +56,8 @@ export const PROPOSALS: Readonly<Record<Pair["proposal"], string>> = {
 };
 
 export function stateOf(pair: Pair): PairState {
-  return pair.kept ? "kept" : pair.chi_sq === null ? "untrusted" : "dropped";
+  if (pair.kept) return "kept";
+  return pair.contradicted || pair.chi_sq !== null ? "dropped" : "untrusted";
 }
 
 /** Root of the trace of a diagonal block of the covariance: rad of the first, a length of the second. */

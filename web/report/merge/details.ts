@@ -12,6 +12,7 @@ const BECAME = {
   dropped: "Dropped: trusted as a pair, but at odds with the other pairs.",
   untrusted: "Not trusted: nothing rests on it.",
 } as const;
+const CONTRADICTED = "Dropped: trusted as a pair, but what it would lay on each other besides does not fit there.";
 
 export interface Actions {
   select: (selection: Selection) => void;
@@ -48,7 +49,7 @@ function ofPair(page: MergePage, index: number, actions: Actions): (Node | strin
     : el("p", { class: "quiet" }, "In the picture they lie as this pair says.");
   return [
     el("header", {}, el("p", { class: "quiet" }, "Pair"), el("h2", { class: "pair" }, name(pair.source, 0), " → ", name(pair.target, 1)),
-      el("p", { class: `became ${state}` }, BECAME[state]), laying),
+      el("p", { class: `became ${state}` }, pair.contradicted ? CONTRADICTED : BECAME[state]), laying),
     section("Figures", table([
       ["Probability", `${pair.probability.toFixed(3)}, trusted from ${page.threshold}`],
       ["Fitness", pair.fitness.toFixed(4)],
