@@ -161,19 +161,21 @@ pub fn run(args: &Args) -> Result<Status> {
     progress.step("writing");
     std::fs::create_dir_all(&args.out).with_context(|| args.out.display().to_string())?;
     let file = |name: String| Path::join(&args.out, name);
+    // So many digits that names are in the order of the scans.
+    let digits = scans.len().saturating_sub(1).to_string().len().max(3);
     for (k, scan) in scans.iter().enumerate() {
-        io::write_cloud(file(format!("scan_{k:03}.ply")), &scan.cloud)?;
-        io::write_transform(file(format!("T_world_{k:03}.txt")), &scan.T_world_sensor)?;
+        io::write_cloud(file(format!("scan_{k:0digits$}.ply")), &scan.cloud)?;
+        io::write_transform(file(format!("T_world_{k:0digits$}.txt")), &scan.T_world_sensor)?;
         if let Some(before) = k.checked_sub(1) {
             let T_before_scan = scans[before].T_world_sensor.inverse() * scan.T_world_sensor;
-            io::write_transform(file(format!("T_{before:03}_{k:03}.txt")), &T_before_scan)?;
+            io::write_transform(file(format!("T_{before:0digits$}_{k:0digits$}.txt")), &T_before_scan)?;
         }
     }
     drop(progress);
 
     for (k, scan) in scans.iter().enumerate() {
-        let path = file(format!("scan_{k:03}.ply"));
-        let shared = scan.overlaps.get(k + 1).map(|o| format!(", {:.0} % seen by the next", 100.0 * o));
+        let path = file(format!("scan_{k:0digits$}.ply"));
+        let shared = scan.overlap_after.map(|o| format!(", {:.0} % seen by the next", 100.0 * o));
         let shared = shared.unwrap_or_default();
         output::answer(&format!("{}: {} points{shared}\n", path.display(), scan.cloud.len()))?;
     }

@@ -32,39 +32,22 @@ pub(super) fn scan(scene: &Bvh, sensor: &Sensor, T_world_sensor: &Rigid, seed: u
     rows.concat()
 }
 
-/// What a sensor sees from where it stands, over a coarse grid of rays without noise.
-pub(super) struct Seen {
-    points_world: Vec<Vector3<f64>>,
-}
-
-pub(super) fn seen(scene: &Bvh, sensor: &Sensor, T_world_sensor: &Rigid) -> Seen {
-    let points = scan(scene, &sensor.coarse(), T_world_sensor, 0);
-    Seen { points_world: points.into_iter().map(|p| T_world_sensor.apply(p).into()).collect() }
-}
-
-impl Seen {
-    /// Share of it that the sensor sees from elsewhere too: in range, in the field of view and not occluded; 0 where there is
-    /// nothing.
-    pub(super) fn share(&self, scene: &Bvh, sensor: &Sensor, T_world_second: &Rigid) -> f64 {
-        let sensor = sensor.coarse();
-        let T_second_world = T_world_second.inverse();
-        let is_seen = |point: &&Vector3<f64>| {
-            let in_second = Vector3::from(T_second_world.apply((**point).into()));
-            let range = in_second.norm();
-            let ray_world = T_world_second.rotation * (in_second / range);
-            sensor.covers(&in_second)
-                && scene
-                    .cast(&T_world_second.translation, &ray_world, range * (1.0 - VISIBILITY_SLACK))
-                    .is_none()
-        };
-        let count = self.points_world.par_iter().filter(is_seen).count();
-        count as f64 / self.points_world.len().max(1) as f64
-    }
-}
-
-/// Share of what the sensor sees at the first pose that it sees at the second one too, as [`Seen::share`].
+/// Share of what the sensor sees at the first pose that it sees at the second one too.
+///
+/// Seen means in range, in the field of view and not occluded; it is counted over a coarse grid of rays without
+/// noise. 0 where nothing is seen.
 pub(super) fn overlap(scene: &Bvh, sensor: &Sensor, T_world_first: &Rigid, T_world_second: &Rigid) -> f64 {
-    seen(scene, sensor, T_world_first).share(scene, sensor, T_world_second)
+    let sensor = sensor.coarse();
+    let seen = scan(scene, &sensor, T_world_first, 0);
+    let T_second_first = T_world_second.inverse() * *T_world_first;
+    let is_seen = |point: &&[f64; 3]| {
+        let in_second = Vector3::from(T_second_first.apply(**point));
+        let range = in_second.norm();
+        let ray_world = T_world_second.rotation * (in_second / range);
+        sensor.covers(&in_second)
+            && scene.cast(&T_world_second.translation, &ray_world, range * (1.0 - VISIBILITY_SLACK)).is_none()
+    };
+    seen.par_iter().filter(is_seen).count() as f64 / seen.len().max(1) as f64
 }
 
 #[cfg(test)]

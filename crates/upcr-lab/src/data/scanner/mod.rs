@@ -76,9 +76,10 @@ pub struct Scan {
     pub cloud: PointCloud,
     /// The true pose of `cloud`'s frame.
     pub T_world_sensor: Rigid,
-    /// For every scan of the sequence, the share of what this one sees that the other sees too: in range, in
-    /// view and not occluded.
-    pub overlaps: Vec<f64>,
+    /// Share of what this scan sees that the one before sees too, and the one after: in range, in view and not occluded.
+    pub overlap_before: Option<f64>,
+    /// See `overlap_before`.
+    pub overlap_after: Option<f64>,
 }
 
 /// The random streams of one seed, by purpose.
@@ -204,15 +205,11 @@ pub fn synth(settings: &SynthSettings) -> Result<Vec<Scan>> {
     let bvh = Bvh::new(&mesh)?;
     let sensor = &settings.sensor;
     let poses = path.poses(settings.scans, settings.overlap, sensor, &bvh);
-    let seen: Vec<_> = poses.iter().map(|pose| cast::seen(&bvh, sensor, pose)).collect();
     let mut turns = stream(settings.seed, Stream::Turn);
     let mut noise_seeds = stream(settings.seed, Stream::Noise);
     let scan = |(k, pose): (usize, &Rigid)| {
-        let overlaps = poses
-            .iter()
-            .enumerate()
-            .map(|(other, second)| if other == k { 1.0 } else { seen[k].share(&bvh, sensor, second) });
-        let overlaps = overlaps.collect();
+        let shared = |other: Option<usize>| Some(cast::overlap(&bvh, sensor, pose, poses.get(other?)?));
+        let (overlap_before, overlap_after) = (shared(k.checked_sub(1)), shared(Some(k + 1)));
         let points = cast::scan(&bvh, sensor, pose, noise_seeds.random());
         if points.is_empty() {
             return Err(invalid("range_m", &format!("scan {k} meets nothing within the sensor's range")));
@@ -227,7 +224,7 @@ pub fn synth(settings: &SynthSettings) -> Result<Vec<Scan>> {
             viewpoint: Some([0.0; 3]),
             ..PointCloud::default()
         };
-        Ok(Scan { cloud, T_world_sensor: *pose * turn.inverse(), overlaps })
+        Ok(Scan { cloud, T_world_sensor: *pose * turn.inverse(), overlap_before, overlap_after })
     };
     poses.iter().enumerate().map(scan).collect()
 }
@@ -303,8 +300,11 @@ mod tests {
             let mut settings = small(scene);
             settings.sensor.noise = RangeNoise::NONE;
             let scans = synth(&settings).unwrap();
-            let overlap = scans[0].overlaps[1];
-            assert!((overlap.min(scans[1].overlaps[0]) - settings.overlap).abs() < 0.12, "{overlap}");
+            let overlap = scans[0].overlap_after.unwrap();
+            assert!(
+                (overlap.min(scans[1].overlap_before.unwrap()) - settings.overlap).abs() < 0.12,
+                "{overlap}"
+            );
 
             let world = |scan: &Scan| -> Vec<Vector3<f64>> {
                 scan.cloud.points.iter().map(|&p| scan.T_world_sensor.apply(p).into()).collect()
