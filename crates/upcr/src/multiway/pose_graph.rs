@@ -82,7 +82,7 @@ pub struct Judged {
 }
 
 /// An edge that is about to join two parts, each of scans whose poses are known in a frame of its own.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 pub struct Joining<'a> {
     /// The edge, by its number.
     pub edge: usize,
