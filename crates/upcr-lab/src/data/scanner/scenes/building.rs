@@ -122,17 +122,14 @@ impl Plan {
                 }
             }
             steps.shuffle(rng);
-            let next = match steps.first() {
-                Some(&next) => {
-                    seen[next[0]][next[1]] = true;
-                    way.push(next);
-                    next
-                }
-                None => {
-                    way.pop();
-                    let Some(&before) = way.last() else { break };
-                    before
-                }
+            let next = if let Some(&next) = steps.first() {
+                seen[next[0]][next[1]] = true;
+                way.push(next);
+                next
+            } else {
+                way.pop();
+                let Some(&before) = way.last() else { break };
+                before
             };
             let a = usize::from(cell[0] == next[0]);
             let door = self.door(a, if next[a] > cell[a] { cell } else { next }, rng);
