@@ -56,12 +56,12 @@ fn main() -> Result<(), Box<dyn Error>> {
         scans.iter().map(|(cloud, _)| looks(cloud, voxel_size, feature)).collect::<upcr::Result<_>>()?;
     let described = start.elapsed();
     let vocabulary = Vocabulary::learn(&features, 0);
-    let words = features.iter().map(|f| vocabulary.describe(f)).collect();
-    tell("words of FPFH", words, start.elapsed().as_secs_f64(), &overlapping);
+    let words: Vec<Vec<f32>> = features.iter().map(|f| vocabulary.describe(f)).collect();
+    tell("words of FPFH", &words, start.elapsed().as_secs_f64(), &overlapping);
 
     let start = Instant::now();
-    let means = features.iter().map(mean).collect();
-    tell("mean of FPFH", means, (described + start.elapsed()).as_secs_f64(), &overlapping);
+    let means: Vec<Vec<f32>> = features.iter().map(mean).collect();
+    tell("mean of FPFH", &means, (described + start.elapsed()).as_secs_f64(), &overlapping);
 
     let network = Network::embedded()?;
     let start = Instant::now();
@@ -70,8 +70,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         .map(|(cloud, _)| Ok(network.representations(&in_unit_sphere(cloud))?.invariant))
         .collect::<upcr::Result<_>>()?;
     let seconds = start.elapsed().as_secs_f64();
-    tell("Γν", centered(invariant.clone(), false), seconds, &overlapping);
-    tell("Γν, whitened", centered(invariant, true), seconds, &overlapping);
+    tell("Γν", &centered(invariant.clone(), false), seconds, &overlapping);
+    tell("Γν, whitened", &centered(invariant, true), seconds, &overlapping);
     Ok(())
 }
 
@@ -115,7 +115,9 @@ fn mean(features: &Descriptors) -> Vec<f32> {
 
 fn normalized(mut vector: Vec<f32>) -> Vec<f32> {
     let length = vector.iter().map(|v| v * v).sum::<f32>().sqrt().max(f32::MIN_POSITIVE);
-    vector.iter_mut().for_each(|v| *v /= length);
+    for v in &mut vector {
+        *v /= length;
+    }
     vector
 }
 
@@ -126,7 +128,9 @@ fn centered(mut vectors: Vec<Vec<f32>>, whitened: bool) -> Vec<Vec<f32>> {
         let mean = vectors.iter().map(|v| v[k]).sum::<f32>() / n;
         let spread = (vectors.iter().map(|v| (v[k] - mean).powi(2)).sum::<f32>() / n).sqrt();
         let scale = if whitened { 1.0 / spread.max(f32::MIN_POSITIVE) } else { 1.0 };
-        vectors.iter_mut().for_each(|v| v[k] = (v[k] - mean) * scale);
+        for v in &mut vectors {
+            v[k] = (v[k] - mean) * scale;
+        }
     }
     vectors.into_iter().map(normalized).collect()
 }
@@ -143,11 +147,11 @@ fn in_unit_sphere(cloud: &PointCloud) -> Vec<[f32; 3]> {
     points.iter().map(|p| off(p).map(|v| (v / radius) as f32)).collect()
 }
 
-fn tell(name: &str, vectors: Vec<Vec<f32>>, seconds: f64, overlapping: &[BTreeSet<usize>]) {
+fn tell(name: &str, vectors: &[Vec<f32>], seconds: f64, overlapping: &[BTreeSet<usize>]) {
     let neighbors = MergeSettings::default().neighbors;
     let mut part: Vec<usize> = (0..vectors.len()).collect();
     let (mut right, mut possible) = (0, 0);
-    for (i, others) in alike(&vectors, neighbors).iter().enumerate() {
+    for (i, others) in alike(vectors, neighbors).iter().enumerate() {
         possible += overlapping[i].len().min(neighbors);
         for (j, _) in others.iter().filter(|(j, _)| overlapping[i].contains(j)) {
             right += 1;
