@@ -1,7 +1,7 @@
 """How `upcr merge` grows: virtual scans of a building, each turned at random, in random order, without any pose.
 
 `upcr synth` makes the building, the more scans the more rooms. A pair that is kept counts as wrong where it is off by more than
-5 degrees or 0.3 m; places are those of the scanner, against the true ones, after the rigid motion that fits each model best.
+2 degrees or 0.1 m; places are those of the scanner, against the true ones, after the rigid motion that fits each model best.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import numpy as np
 
 from multiway import places_off
 
-WRONG_DEG, WRONG_M = 5.0, 0.3
+WRONG_DEG, WRONG_M = 2.0, 0.1
 
 
 def measured(command: list[str]) -> tuple[float, float, float, str]:
@@ -61,7 +61,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--folder", type=Path, default=Path("target/building"), help="where scans are made, and kept")
-    parser.add_argument("--args", default="", help="more of upcr merge's")
+    parser.add_argument("--args", default="--viewpoint 0,0,0", help="more of upcr merge's")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
 

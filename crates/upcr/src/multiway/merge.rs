@@ -26,14 +26,16 @@ const JOINING_ROUNDS: usize = 3;
 const CLOSING_ROUNDS: usize = 2;
 /// Points of a scan that tell whether it overlaps another, edge of the cells in which they do, in voxels, and share of the
 /// smaller scan's cells.
-const SAMPLE: usize = 512;
+const SAMPLE: usize = 2048;
 const CELL_VOXELS: f64 = 8.0;
 const OVERLAPPING: f64 = 0.25;
 /// Probability from which on a pair is not looked at again from where the poses lay it.
 const SURE: f64 = 0.9;
-/// Pairs that are asked whether two parts may be joined, and the share by which they are to overlap.
+/// Pairs that are asked whether two parts may be joined, the share by which they are to overlap, and edge of the cells in which they
+/// do: so small that the two sides of a thing are apart.
 const WITNESSES: usize = 6;
 const WITNESSING: f64 = 0.4;
+const WITNESS_CELL_VOXELS: f64 = 3.0;
 /// Poses that differ by less, in voxels anywhere on the source, are one.
 const SAME_VOXELS: f64 = 4.0;
 /// Scans in one cell that are looked at.
@@ -287,7 +289,7 @@ struct Surveyed {
     bytes: usize,
     /// Some points, about the centre.
     sample: Vec<[f32; 3]>,
-    /// The cells of these.
+    /// The small cells of these.
     cells: HashSet<[i32; 3]>,
     /// What it looks like.
     looks: Descriptors,
@@ -355,9 +357,9 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
         }
     }
 
-    /// Edge of the cells in which scans overlap.
-    fn cell(&self) -> f64 {
-        CELL_VOXELS * self.voxel_size
+    /// The small cell in which a place of a scan, about its centre, is.
+    fn small_cell(&self, place: &Vector3<f64>) -> [i32; 3] {
+        cell_of(place, WITNESS_CELL_VOXELS * self.voxel_size)
     }
 
     fn surveyed(&self, scan: usize) -> Result<(ReadyScan, Surveyed)> {
@@ -370,7 +372,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             center: ready.center(),
             radius: ready.radius(),
             bytes: ready.bytes(),
-            cells: sample.iter().map(|p| cell_of(&Vector3::from(p.map(f64::from)), self.cell())).collect(),
+            cells: sample.iter().map(|p| self.small_cell(&Vector3::from(p.map(f64::from)))).collect(),
             sample,
             looks: looks(&cloud, self.voxel_size, feature)?,
         };
@@ -612,7 +614,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
         found.into_iter().take(WITNESSES).map(|(_, a, b, T_b_a)| Wanted::laid(a, b, T_b_a)).collect()
     }
 
-    /// Share of one of two scans that lies in cells of the other: of that of which it is more.
+    /// Share of one of two scans that lies in small cells of the other: of that of which it is more.
     fn share(&self, a: usize, b: usize, T_b_a: &Rigid) -> f64 {
         let inside = |from: usize, to: usize, T: &Rigid| {
             let (from, to) = (&self.surveyed[from], &self.surveyed[to]);
@@ -620,7 +622,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             let center = Vector3::from(offset) - Vector3::from(to.center);
             let hits = from.sample.iter().filter(|p| {
                 let p = T.rotation * Vector3::from(p.map(f64::from)) + center;
-                to.cells.contains(&cell_of(&p, self.cell()))
+                to.cells.contains(&self.small_cell(&p))
             });
             hits.count() as f64 / from.sample.len().max(1) as f64
         };
@@ -667,7 +669,7 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
                 .iter()
                 .map(|p| {
                     let p = Vector3::from(p.map(f64::from)) + center;
-                    cell_of(&solution.poses[scan].apply(p.into()).into(), self.cell())
+                    cell_of(&solution.poses[scan].apply(p.into()).into(), CELL_VOXELS * self.voxel_size)
                 })
                 .collect();
             cells_of[scan] = cells.len();

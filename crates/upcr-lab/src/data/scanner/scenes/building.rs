@@ -136,6 +136,9 @@ impl Plan {
             tour.push(door);
             tour.push(self.somewhere_in(next, rng));
         }
+        if tour.len() == 1 {
+            tour.push(self.somewhere_in([0, 0], rng));
+        }
         for a in 0..2 {
             for column in 0..columns {
                 for row in 0..rows {
