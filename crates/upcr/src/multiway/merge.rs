@@ -33,8 +33,8 @@ const OVERLAPPING: f64 = 0.25;
 const SURE: f64 = 0.9;
 /// Pairs that are asked whether two parts may be joined, the share by which they are to overlap, and edge of the cells in which they
 /// do: so small that the two sides of a thing are apart.
-const WITNESSES: usize = 6;
-const WITNESSING: f64 = 0.4;
+const WITNESSES: usize = 12;
+const WITNESSING: f64 = 0.25;
 const WITNESS_CELL_VOXELS: f64 = 3.0;
 /// Poses that differ by less, in voxels anywhere on the source, are one.
 const SAME_VOXELS: f64 = 4.0;
@@ -611,6 +611,11 @@ impl<'a, S: Scans + ?Sized> Merge<'a, S> {
             }
         }
         found.sort_by(|x, y| y.0.total_cmp(&x.0).then((x.1, x.2).cmp(&(y.1, y.2))));
+        // Each scan but once: scans of one room say the same.
+        let mut asked = BTreeSet::new();
+        found.retain(|&(_, a, b, _)| {
+            !asked.contains(&a) && !asked.contains(&b) && asked.insert(a) && asked.insert(b)
+        });
         found.into_iter().take(WITNESSES).map(|(_, a, b, T_b_a)| Wanted::laid(a, b, T_b_a)).collect()
     }
 
