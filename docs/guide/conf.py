@@ -25,7 +25,7 @@ nitpicky = True
 # Types of other packages, whose references are not at hand without a network, and names that speak for themselves.
 nitpick_ignore_regex = [
     ("py:class", r"(numpy|npt|os|collections|typing|pyarrow|pa|ray)\..*|NDArray|Unpack"),
-    ("py:class", "CloudLike|FloatArray|Pairs?|Method|Feature|Refinement|Kernel|Dataset|Table"),
+    ("py:class", "CloudLike|FloatArray|Pairs?|Method|Feature|Refinement|Kernel|Reason|Dataset|Table"),
     ("py:exc", r"ray\..*"),
 ]
 
